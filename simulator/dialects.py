@@ -93,7 +93,7 @@ class Dialect(Driven):
 
     def restart(self) -> None:
         """Set the car at the start of its road, at rest."""
-        self.run = Run(self.track, "autonomous")
+        self.run, self.seen = Run(self.track, "autonomous"), -1.0  # simulated s at the last frame
         self.views[0].disturb(self.disturbance)
         self.steering = self.throttle = 0.0
 
@@ -131,8 +131,13 @@ class Dialect(Driven):
         raise NotImplementedError
 
     def frame(self) -> np.ndarray:
-        """Render the centre camera: uint8 (160, 320, 3), RGB."""
-        return self.views[0].frames(self.run.car.node.get_transform())[0]
+        """Render the centre camera, once for each state, since a frame's drops and flakes depend on how many it had.
+
+        uint8 (160, 320, 3), RGB.
+        """
+        if self.seen < self.run.time:
+            self.seen, self.image = self.run.time, self.views[0].frames(self.run.car.node.get_transform())[0]
+        return self.image
 
     def state(self, speed_unit: float = 1.0) -> dict[str, str]:
         """Return what all dialects tell; speed_unit: m/s."""

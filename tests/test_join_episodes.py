@@ -191,6 +191,17 @@ def test_an_episode_can_be_ended_at_any_time_and_then_telemetry_goes_on():
     assert abs(number(data, "angular_difference")) < 0.1
 
 
+def test_flakes_do_not_depend_on_how_many_telemetries_a_pause_had():
+    dialect, images = Episodes(LAKE), []
+    for telemetries in (1, 3):
+        dialect.handle("start_episode", {"track_name": "lake", "weather_name": "snowy"})
+        for _ in range(telemetries):
+            dialect.telemetry()
+        dialect.step()
+        images.append(json.loads(dialect.telemetry()[2:])[1]["image"])
+    assert images[0] == images[1]
+
+
 def test_what_a_program_that_has_gone_was_to_hear_is_not_told_to_the_next(monkeypatch):
     monkeypatch.undo()  # what `at_once` has changed
     heard = []
