@@ -202,23 +202,6 @@ def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_howeve
     assert len(fast) > 12 and fast == drive(0.03)
 
 
-def test_a_driver_is_waited_for_even_if_an_earlier_program_had_none(monkeypatch):
-    monkeypatch.undo()  # what `at_once` has changed
-    monkeypatch.setattr("simulator.join.BRIEFLY", 0.1)
-
-    def answer(data, n):
-        if not data["track"]:
-            return [["track", {"track_string": ROADS[0]}]]
-        sent[len(program.requests) - 1].append(data["image"])
-        steering = n // 2 if sent[1] else len(set(sent[0]))  # in the second, a driver sees a frame that is sent twice
-        return [steer(steering / 1000, 1)] if n < 25 else None
-
-    sent: list[list[str]] = [[], []]
-    with Program(answer, sessions=2) as program:
-        Joined(Roads(LAKE), "127.0.0.1", program.port, wait=1.0, pace=0, rate=15).run()
-    assert len(sent[1]) > 1.5 * len(set(sent[1]))
-
-
 @pytest.mark.parametrize("run", [1, 3])
 def test_a_driver_is_waited_for_little_longer_than_it_takes_even_if_its_commands_repeat(run, monkeypatch):
     """Programs end an episode after 30 s of real time. A command stays the same for `run` frames."""

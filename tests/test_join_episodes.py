@@ -202,7 +202,7 @@ def test_flakes_do_not_depend_on_how_many_telemetries_a_pause_had():
     assert images[0] == images[1]
 
 
-def test_what_a_program_that_has_gone_was_to_hear_is_not_told_to_the_next(monkeypatch):
+def test_a_program_is_told_nothing_that_an_earlier_one_was_to_hear_and_its_driver_is_sought_anew(monkeypatch):
     monkeypatch.undo()  # what `at_once` has changed
     heard = []
 
@@ -216,8 +216,11 @@ def test_what_a_program_that_has_gone_was_to_hear_is_not_told_to_the_next(monkey
     dialect = Episodes(LAKE)
     dialect.ready = True
     with Server(answer, sessions=2) as server, pytest.raises(SimulatorError):
-        Joined(dialect, "127.0.0.1", server.port, wait=1.0, pace=0, rate=15).run()
+        joined = Joined(dialect, "127.0.0.1", server.port, wait=1.0, pace=0, rate=15)
+        joined.driver.apart = False  # for the earlier one
+        joined.run()
     assert heard == 2 * ["car_telemetry"]
+    assert joined.driver.apart is None
 
 
 def test_unknown_names_are_refused_and_known_ones_all_start():
