@@ -5,6 +5,7 @@ from itertools import pairwise
 from statistics import fmean
 from typing import Any, TypedDict
 
+from cloning.base.outputs import plural
 from cloning.lane.foretell import EARLIEST, LATEST, WINDOW
 from simulator.benchmark.tasks import GROUPS, Task
 from simulator.driving import Drive
@@ -57,8 +58,9 @@ def foretelling(drives: Sequence[Driven]) -> str | None:
     if not ordinary + departures:
         return None
     return (
-        f"of {departures} departures, {foretold} were foretold {LATEST:g} to {EARLIEST:g} s ahead; false alarms in "
-        f"{false} of {ordinary} times {WINDOW:g} s of drives without a departure"
+        f"of {plural(departures, 'departure')} more than {LATEST:g} s after the start or the one before, {foretold} "
+        f"foretold {LATEST:g} to {EARLIEST:g} s ahead; false alarms in {false} of {ordinary} times {WINDOW:g} s of "
+        "drives without a departure"
     )
 
 
