@@ -3,6 +3,7 @@
 import json
 import runpy
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import av
@@ -15,6 +16,7 @@ from rendered import render_frame, render_recording
 
 from cloning.base import program
 from cloning.lerobot import __main__ as lerobot
+from cloning.lerobot.source import Sample, write_recording
 from cloning.recordings.check import check_images
 from cloning.recordings.images import encode, read_frame
 from cloning.recordings.log import CheckedRecording, read_recording
@@ -314,6 +316,12 @@ def test_rows_without_a_time_or_a_number_are_left_out(data_set, tmp_path):
     printed = converted(data_set, "--output", tmp_path / "recording")
     assert "time or numbers are not finite is left out (4 times)" in printed
     assert len(checked(tmp_path / "recording")) == 15
+
+
+def test_rows_with_the_same_time_are_of_one_drive_and_have_images_of_their_own(tmp_path):
+    sample = Sample(1700000000.031, [np.zeros((160, 320, 3), np.uint8)], {"steering": 0.0})
+    write_recording(iter(60 * [sample]), tmp_path / "one", 1.0, Counter())
+    assert np.diff(read_recording(tmp_path / "one").time) == pytest.approx(0.001, abs=1e-6)
 
 
 def test_a_recording_without_images_is_left_out(recordings, tmp_path):

@@ -49,7 +49,7 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
     does not fit, and how often. Raises RecordingError if the samples' steering is beyond it, or if there are none, and
     OSError, also if the folder exists; then nothing is written.
     """
-    rows, shift, last = [], 0.0, -np.inf
+    rows, shift, before, last = [], 0.0, -np.inf, -np.inf
     with folder_written_whole(folder) as temporary:
         (temporary / IMAGE_FOLDER).mkdir()
         for sample in samples:
@@ -73,11 +73,11 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
             if max(throttle, brake) > 1:
                 notes["throttle or brake above 1 is written as 1"] += 1
             time = sample.time + shift
-            if time < last:
+            if time < before:
                 shift += last + 2 * DRIVE_GAP - time
                 time = last + 2 * DRIVE_GAP
-            last = time = max(time, last + MILLISECOND)
-            stamp = time_stamp(datetime(1970, 1, 1) + timedelta(seconds=time))
+            before, last = time, round(max(time, last + MILLISECOND), 6)  # else the sum falls short of a millisecond
+            stamp = time_stamp(datetime(1970, 1, 1) + timedelta(seconds=last))
             names = [f"{camera}_{stamp}.jpg" for camera in CAMERAS]
             for name, frame in zip(names, _three([fit(image, notes) for image in sample.images], notes), strict=True):
                 (temporary / IMAGE_FOLDER / name).write_bytes(encode(frame, JPEG_QUALITY))
