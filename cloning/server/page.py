@@ -119,7 +119,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     def index() -> str:
         constants = {"seconds": SHOWN_SECONDS, "top_speed": TOP_SPEED_MPH, "limits": LIMITS}
         host, _, port = flask.request.host.rpartition(":")
-        where = (host.strip("[]"), port) if port.isdecimal() else ("127.0.0.1", str(PORT))
+        where = (host.strip("[]"), port) if port.isdecimal() else (flask.request.host.strip("[]"), "80")
         commands = [stand_in(words, *where) for words in ("drive --realtime --track jungle", "window --autonomous")]
         shown = {"model": server.model, "commands": commands, "usual_port": PORT, "is_usual": where[1] == str(PORT)}
         shown["activate"] = "" if program.installed else program.ACTIVATE
