@@ -274,8 +274,9 @@ def regress(signs: np.ndarray, away: np.ndarray, share: np.ndarray) -> np.ndarra
 def fit(driven: Sequence[tuple[Course, Drive]]) -> Limits:
     """Return the limits; driven: what tunes them. Raises UserError for a network that drives nowhere."""
     fair = [(course, each) for course, each in driven if not course.disturbance and not len(each.departures)]
+    lost = UserError("the network leaves the road in nearly every clear drive, so nothing is ordinary; train it longer")
     if not fair:
-        raise UserError("the network leaves the road in every clear drive, so nothing is ordinary; train it longer")
+        raise lost
     # Every second one says what is ordinary: in these the networks' activations are nearer to it than in any others.
     known = {course for course, _ in fair[::2]}
     seen = [each.seen for course, each in fair if course in known]
@@ -295,6 +296,8 @@ def fit(driven: Sequence[tuple[Course, Drive]]) -> Limits:
         return lambda part: part.signs[:, at]
 
     of_all, extreme = stayed(lambda part: part.signs @ weights), np.full(len(weights) // len(MEAN_TIMES), NEVER)
+    if not sum(map(len, of_all)):
+        raise lost
     if sum(map(len, of_all)) >= 1 / RARE:  # fewer windows can't tell what is rare
         extreme = np.array([exceeded(stayed(sign(at)), RARE) for at in range(len(extreme))])
     of_one = stayed(lambda part: odds_of_one(part.signs, extreme))
