@@ -197,11 +197,13 @@ def test_a_replay_disturbs_the_warped_frame_once_whoever_looks(sample_recording)
 
 def test_episodes_begin_anew_and_rain_falls_in_rainy_weather():
     def images(stage, weather):
-        program = Episodes(stage)
-        found = []
+        program, found = Episodes(stage), list[list[np.ndarray]]()
         for _ in range(2):
             program.start("lake", weather, "day")
-            found.append([decode(base64.b64decode(program.state()["image"])) for _ in range(2)])
+            found.append([])
+            for _ in range(2):
+                found[-1].append(decode(base64.b64decode(program.state()["image"])))
+                program.seen = -1.0  # drawn again, as after a step
         return np.array(found)
 
     noisy = images(Stage("lake", None, 0, {}, Disturbance("noise", 4)), "sunny")
