@@ -69,6 +69,7 @@ class CorrectedClient(Client):
             self.correcting = True
             self.corrections += 1
             self.recording.begin_drive()
+            self.recorded.disturb(self.recorded.disturbance)  # late frames are none of the correction before
             self._away_at = run.time
         elif abs(offset) > NEAR or abs(heading_error) > ALIGNED:
             self._away_at = run.time

@@ -40,9 +40,12 @@ def _prepare(view: _View) -> None:
     _cameras(view)
 
 
-def _render(view: _View, transform: TransformState) -> list[bytes]:
-    """Return the three cameras' JPEGs; runs in a rendering process."""
-    return [jpeg(frame) for frame in _cameras(view).frames(transform)]
+def _render(view: _View, transform: TransformState, begins: bool) -> list[bytes]:
+    """Return the three cameras' JPEGs, perhaps the first of a drive; runs in a rendering process."""
+    cameras = _cameras(view)
+    if begins:
+        cameras.disturb(*view[2:])
+    return [jpeg(frame) for frame in cameras.frames(transform)]
 
 
 def sample(run: Run) -> dict[str, Any]:
@@ -87,6 +90,7 @@ def record(
         for _ in range(renderers):
             pool.submit(_prepare, view)
         bar = stack.enter_context(progress_bar(round(laps * track.length), "m"))
+        begins = True  # whether the next row is the first of a drive, before which no frame was seen
 
         def write() -> None:
             images, row = pending.popleft()
@@ -98,9 +102,12 @@ def record(
                     while pending:
                         write()
                     recording.begin_drive()
+                    begins = True
                 run.step(*expert.drive(run))
-                if clock.due(run.time) and expert.recordable:
-                    images = pool.submit(_render, view, run.car.node.get_transform())
+                due = clock.due(run.time)
+                begins = begins or (due and not expert.recordable)
+                if due and expert.recordable:
+                    images, begins = pool.submit(_render, view, run.car.node.get_transform(), begins), False
                     pending.append((images, sample(run)))
                     if len(pending) > 2 * renderers:
                         write()

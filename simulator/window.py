@@ -250,6 +250,7 @@ class Window(ShowBase):
     def begin_drive(self) -> None:
         """Let what is recorded from now on be a drive of its own."""
         self.clock = SampleClock(self.simulation.time)
+        self.cameras.disturb(self.cameras.disturbance)
         if self.recording:
             self.recording.begin_drive()
 

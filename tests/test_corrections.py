@@ -167,7 +167,7 @@ class Seat(Window):
 
 
 def test_the_window_records_only_what_the_person_drives(tmp_path, monkeypatch):
-    rows = []
+    rows, begun = [], list[object]()
 
     def write_row(recording, cameras, run):
         rows.append((recording.start.timestamp() + run.time, run.steering))
@@ -175,6 +175,7 @@ def test_the_window_records_only_what_the_person_drives(tmp_path, monkeypatch):
 
     monkeypatch.setattr(window, "write_row", write_row)
     seat = Seat(tmp_path / "x-corrections")
+    monkeypatch.setattr(seat.cameras, "disturb", begun.append)
     seat.act("record")
     seat.ticks(1, monkeypatch)
     assert not rows, "drive.py drives"
@@ -184,6 +185,7 @@ def test_the_window_records_only_what_the_person_drives(tmp_path, monkeypatch):
     seat.finish()
     times, steering = np.array(rows).T
     assert len(rows) in (14, 15, 16), "two halves of a second"
+    assert len(begun) == 3, "late frames are none of the drive before"
     assert (np.diff(times) > DRIVE_GAP).sum() == 1 and steering.any()
     assert steering[times < times[0] + 0.6].min() > 0 > steering[-3:].max()
 

@@ -10,8 +10,9 @@ from steer_server import STEER, Server
 
 from cloning.base.errors import SimulatorError, UserError
 from cloning.network.network import SEEN_ROWS, SHIPPED_MODEL
-from cloning.recordings.images import decode
+from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
+from cloning.recordings.writer import RecordingWriter
 from cloning.replay import replay
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber, disturb
 from cloning.road.track import Track
@@ -19,8 +20,10 @@ from cloning.training import light
 from simulator import driving, record
 from simulator.__main__ import main
 from simulator.cameras import jpeg
+from simulator.correct import CorrectedClient
 from simulator.dialects import Episodes, Stage
 from simulator.environment import Drive
+from simulator.run import Run
 from tools import robustness
 
 IMAGE_KINDS = [kind for kind in KINDS if kind not in ("dropped", "late")]
@@ -265,3 +268,18 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(sample_recording
     file.write_text("{", encoding="utf-8")
     with pytest.raises(UserError, match=r"robustness\.json: damaged .*; delete it, and start again"):
         robustness.main(words)
+
+
+def test_late_frames_of_a_recorded_drive_are_none_of_the_drive_before(tmp_path):
+    late, run = Disturbance("late", 5), Run(Track("road-1"), "autonomous")
+    for name, disturbance in (("clear", None), ("late", late)):
+        record.record(tmp_path / name, Track("road-1"), 0.12, recovery=True, disturbance=disturbance)
+    clear, disturbed = (read_recording(tmp_path / name) for name in ("clear", "late"))
+    row = int(np.diff(clear.time).argmax()) + 1  # the first of another return
+    assert (read_frame(disturbed.path(row)) == read_frame(clear.path(row))).all()
+    with RecordingWriter(tmp_path / "corrections") as recording:
+        client = CorrectedClient(run, driving.scene_of("road-1", 0), 9, recording, "", 0, 1, late)
+        client.recorded.frames(run.car.node.get_transform())
+        run.offset = 2.0
+        client.next_frame()
+        assert not client.recorded.disturbers[0].shown
