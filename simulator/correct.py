@@ -69,7 +69,8 @@ class CorrectedClient(Client):
             self.correcting = True
             self.corrections += 1
             self.recording.begin_drive()
-            self.recorded.disturb(self.recorded.disturbance)  # late frames are none of the correction before
+            for cameras in (self.cameras, self.recorded):  # no late frame is of the drive before
+                cameras.disturb(cameras.disturbance)
             self._away_at = run.time
         elif abs(offset) > NEAR or abs(heading_error) > ALIGNED:
             self._away_at = run.time

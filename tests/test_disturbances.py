@@ -279,7 +279,8 @@ def test_late_frames_of_a_recorded_drive_are_none_of_the_drive_before(tmp_path):
     assert (read_frame(disturbed.path(row)) == read_frame(clear.path(row))).all()
     with RecordingWriter(tmp_path / "corrections") as recording:
         client = CorrectedClient(run, driving.scene_of("road-1", 0), 9, recording, "", 0, 1, late)
-        client.recorded.frames(run.car.node.get_transform())
+        for cameras in (client.cameras, client.recorded):
+            cameras.frames(run.car.node.get_transform())
         run.offset = 2.0
         client.next_frame()
-        assert not client.recorded.disturbers[0].shown
+        assert not client.recorded.disturbers[0].shown and not client.cameras.disturbers[0].shown
