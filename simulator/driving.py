@@ -24,6 +24,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from cloning.base.arguments import MAX_PORT
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
@@ -208,7 +209,7 @@ def digest_of(file: Path) -> str:
 def server_address(driver: str) -> tuple[str, int] | None:
     """Return the host and port that a driver is, None if it is a file or built in."""
     match = re.fullmatch(r"([\w.-]+):(\d{1,5})", driver)
-    return (match[1], int(match[2])) if match else None
+    return (match[1], int(match[2])) if match and int(match[2]) <= MAX_PORT else None
 
 
 def workers_for(driver: str, processes: int, scheduler: str | None) -> AbstractContextManager[Executor]:

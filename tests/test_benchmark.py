@@ -296,6 +296,12 @@ def test_its_page_is_read_on_a_phone(page, tmp_path):
     assert page.box("tbody th")[2] > 100, "not one letter below the other"
 
 
+def test_a_port_that_there_cannot_be_is_not_taken_for_another():
+    assert driving.server_address("127.0.0.1:65535") == ("127.0.0.1", 65535)
+    with pytest.raises(UserError, match=r"127\.0\.0\.1:70103: no such file"):
+        driving.workers_for("127.0.0.1:70103", 1, None)  # which a socket takes for 4567
+
+
 def test_real_recordings_that_are_missing_are_told_before_anything_is_driven(tmp_path):
     with pytest.raises(UserError, match=r"lake-ccw: no driving_log\.csv; data/README\.md says where"):
         run(__main__.parse_arguments(["benchmark", "straight", "--recordings", str(tmp_path)]))
