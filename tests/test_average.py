@@ -12,7 +12,7 @@ from cloning.lane.predict import Step
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.road.disturbances import Disturbance, Disturber
+from cloning.road.disturbances import Disturbance, Disturber, moved
 from cloning.road.motion import Stretch
 from cloning.road.track import Track
 from simulator.benchmark import tasks
@@ -52,11 +52,15 @@ def test_one_frame_without_contrast_has_no_clear_ones_averaged(driven, grey):
             assert averaged(seen, step) is seen
 
 
-@pytest.mark.parametrize("foul", ["noise:5", "night:5"])
-def test_noisy_frames_become_more_like_those_without_noise(driven, foul):
+@pytest.mark.parametrize(
+    ("foul", "pitch", "most"), [("noise:5", 0, 0.7), ("noise:5", 3, 0.7), ("night:5", 0, 0.8), ("snow:4", 0, 0.4)]
+)
+def test_noisy_frames_become_more_like_those_without_noise(driven, foul, pitch, most):
+    """pitch: by how many rows the view goes up and down, as in hills; most: of the error without averaging."""
     averaged, disturber = Average(), Disturber(Disturbance.parse(foul), 1)
     errors = []
-    for number, (frame, step) in enumerate(driven):
+    for number, (clear, step) in enumerate(driven):
+        frame = moved(clear, (0, pitch * np.sin(number), 0))
         noisy = disturber(frame)
         mean, blurred = averaged(noisy, step), cv2.blur(frame, (3, 3))
         if number > 2 * average.MEMORY:
@@ -64,7 +68,21 @@ def test_noisy_frames_become_more_like_those_without_noise(driven, foul):
             wanted, *seen = (each[ROAD].astype(float).ravel() for each in (blurred, noisy, mean))
             errors.append([1 - np.corrcoef(wanted, each)[0, 1] for each in seen])
     noisy_error, mean_error = np.mean(errors, axis=0)
-    assert mean_error < 0.8 * noisy_error
+    assert mean_error < most * noisy_error
+
+
+def test_a_frames_movement_is_found_unless_the_camera_was_shaken(driven):
+    frame, still = driven[30][0], (0.0, 0.0, 0.0)
+
+    def compared(right, down, degrees):
+        return average._expected(frame, moved(frame, (right, down, degrees)), still)
+
+    expected, seen = compared(2, -3, 1)
+    movement = average._movement(expected, seen)
+    assert movement is not None
+    assert cv2.absdiff(average._moved(expected, movement), seen).mean() < 0.4 * cv2.absdiff(expected, seen).mean()
+    assert average._movement(*compared(0, 5, 0)) is not None and average._movement(*compared(0, 9, 0)) is None
+    assert average._movement(expected, np.zeros_like(seen)) is None
 
 
 def test_a_frame_that_repeats_is_not_averaged_again_and_unknown_movement_averages_nothing(driven):
@@ -89,7 +107,7 @@ def test_the_frames_of_real_recordings_are_clear(folder):
         frame = decode(recording.path(row).read_bytes())
         assert averaged(frame, Step(1 / 15, bend, metres)) is frame
         noise.append(averaged.noise)
-    assert np.mean(noise) < 0.6 * average.LEAST
+    assert np.mean(noise) < 0.75 * average.LEAST
 
 
 def test_the_shipped_network_drives_better_in_snow(monkeypatch):
