@@ -28,7 +28,7 @@ import torch
 from cloning.base.arguments import MAX_PORT, address, command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
-from cloning.base.outputs import plural
+from cloning.base.outputs import as_typed, plural
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.lane.pilot import Pilot
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
@@ -317,9 +317,10 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
             f"{argument}: a model of Keras, which PyTorch can't read; `python model.py` trains one that drives"
         )
     if folder is None and not argument.is_file() and argument.suffix != ".pt":
+        model = DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
         raise UserError(
             f"{argument}: not a model file; name the model first and the folder for the frames second: "
-            f"`python drive.py {DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL} {argument}`"
+            f"`{as_typed('python', 'drive.py', model, argument)}`"
         )
     return argument
 
@@ -365,7 +366,8 @@ def main() -> int:
     if arguments.stop_when_lost and not limits:
         raise UserError(
             f"{limits_file(model)}: no such file for this network, so nothing tells when it is lost; "
-            f"`python -m tools.foretell {model}`, in a clone of the project, makes it, or leave out --stop-when-lost"
+            f"`{as_typed('python', '-m', 'tools.foretell', model)}`, in a clone of the project, makes it, or leave out "
+            "--stop-when-lost"
         )
     if arguments.folder:
         saved_frames.check_folder(arguments.folder)

@@ -27,6 +27,7 @@ import numpy as np
 from cloning.base.arguments import MAX_PORT
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
+from cloning.base.outputs import as_typed
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.lane.pilot import Pilot
 from cloning.network.compute import one_thread
@@ -130,7 +131,8 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
     except ImportError as error:
         raise UserError(f"{error}; pip install onnxruntime") from None
     if not Path(driver).is_file():
-        raise UserError(f"{driver}: no such file; `python -m cloning.network.export model.pt {driver}` writes one")
+        export = as_typed("python", "-m", "cloning.network.export", "model.pt", driver)
+        raise UserError(f"{driver}: no such file; `{export}` writes one")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     try:

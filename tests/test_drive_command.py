@@ -31,6 +31,7 @@ def test_mistakes_are_reported(model_file, tmp_path):
     with serving(model_file) as other:  # two servers must not share a port, which SO_REUSEPORT would let them do
         for arguments, words in (
             ((tmp_path / "foreign.pt",), "not a model of this project"),
+            ((tmp_path / "my run",), f".pt '{tmp_path / 'my run'}'`"),
             ((model_file, tmp_path / "mine"), "thesis.txt"),
             ((model_file, "--stop-when-lost"), "nothing tells when it is lost"),
             ((model_file, tmp_path / "run1", "--port", other.port), "Udacity's simulator connects to 4567 only"),
