@@ -245,9 +245,10 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
 
 def test_frames_that_are_in_two_recordings_are_told(sample_recording, tmp_path, capsys):
     """As those of a part that was exported: what is cut from one stays in the other."""
-    part = shutil.copytree(sample_recording, tmp_path / "part")
-    model.read_observations(REPORT, [sample_recording, part], False)
-    assert "54 frames are in more than one of these recordings" in capsys.readouterr().out
+    parts = [shutil.copytree(sample_recording, tmp_path / name) for name in ("part", "another")]
+    for others in (parts[:1], parts):
+        model.read_observations(REPORT, [sample_recording, *others], False)
+        assert "\n54 frames are in more than one of these recordings" in capsys.readouterr().out
     model.read_observations(REPORT, [sample_recording], False)
     assert "more than one" not in capsys.readouterr().out
 

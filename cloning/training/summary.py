@@ -113,7 +113,7 @@ def tell_of_twins(observations: Observations) -> None:
     """
     order = np.argsort(observations.frame, kind="stable")  # np.unique takes ten times as long
     frame, recording = observations.frame[order], observations.recording[order]
-    if twins := np.count_nonzero((frame[1:] == frame[:-1]) & (recording[1:] != recording[:-1])):
+    if twins := len(np.unique(frame[1:][(frame[1:] == frame[:-1]) & (recording[1:] != recording[:-1])])):
         are = "frame is" if twins == 1 else "frames are"
         print(f"{twins:,} {are} in more than one of these recordings: there they count again, also if one cuts them")
 
