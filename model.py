@@ -436,7 +436,7 @@ def execute(command: Command) -> int:
 def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, seed: int = 0, **process: Any) -> int:
     """Train a network by any recipe, as the command does; return the exit status, or under torchrun end with it.
 
-    recordings, output, process: as for the options; a run is resumed only if its recipe is this one.
+    recordings, output, process: as for the options; a run is resumed only if its recipe and its recordings are these.
     """
     run = Run(recipe, tuple(map(str, recordings)), seed)
     return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))

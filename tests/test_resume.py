@@ -209,6 +209,7 @@ def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys
     ):
         assert model.train(changed, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 2
         assert words in capsys.readouterr().err
+    assert model.train(short, ["nowhere"], begun / "model.pt", device="cpu", resume=True) == 2, "nor by its own data"
     more = replace(short, epochs=2)
     assert model.train(more, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 0
 

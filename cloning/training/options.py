@@ -54,7 +54,7 @@ class Process:
             raise UserError(f"--device {self.device}: torch finds no such GPU on this machine; leave the option out")
 
 
-EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind)) - {"recordings"}
+EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind))
 
 
 class Command(NamedTuple):
