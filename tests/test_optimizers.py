@@ -12,9 +12,9 @@ from torch import nn
 import model
 from cloning.base.errors import ModelError
 from cloning.network.network import Network
-from cloning.training.checkpoint import Checkpoint, Progress
+from cloning.training.checkpoint import METRICS, Checkpoint, Progress, read_saved_run
 from cloning.training.optimizers import Adam, Muon, orthogonal
-from cloning.training.options import Process, Run
+from cloning.training.options import MAX_EPOCHS, Process, Run
 from model import REPORT, ROBUST
 
 
@@ -47,6 +47,18 @@ def test_a_network_that_cannot_be_trained_or_saved_whole_is_refused_before(kind,
     network, process = kind(), Process("model.pt")
     with pytest.raises(ModelError, match=words):
         Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), ("", ""))
+
+
+def test_the_state_of_the_longest_run_can_be_resumed(tmp_path):
+    """One of more epochs ended in files that no program here reads, its models', too."""
+    network, chance, path = Network(), np.random.default_rng(1), tmp_path / "model.pt"
+    adam = Adam(network.parameters())
+    adam.restore({index: adam.zeros(index) for index in range(len(adam.parameters))})
+    rows = ((epoch + 1, 128, *chance.random(4).tolist()) for epoch in range(MAX_EPOCHS))
+    history = [dict(zip(METRICS, row, strict=True)) for row in rows]
+    progress = Progress(number=MAX_EPOCHS, history=history, trail=chance.random(1999).tolist())
+    Checkpoint(Run(REPORT), Process(str(path)), network, adam, ("", "")).save(progress)
+    assert read_saved_run(tmp_path / "model-resume.pt", {"report": REPORT}).progress.history == history
 
 
 def networks():

@@ -222,6 +222,7 @@ def test_it_trains_and_replays_without_what_only_some_systems_have(sample_record
         (["nowhere", "--output", "runs/a/model.pt"], "data/README.md"),
         (["data/lake/IMG"], "data/README.md"),
         (["--epochs", "0"], "--epochs"),
+        (["--epochs", "30000"], "at most 20000"),
         (["--learning-rate", "nan"], "--learning-rate"),
         (["--side-correction", "100"], "100 is not a finite number of at least -1"),
         (["--seed", str(2**64)], "--seed"),

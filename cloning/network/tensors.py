@@ -21,7 +21,7 @@ from cloning.base.errors import ModelError
 from cloning.base.files import write
 
 MAX_SIZE = 30_000_000  # bytes of a file, and of its contents in memory; the largest file of this project has 7 million
-MAX_STRUCTURE = 2_000_000  # bytes of all but the tensors: 30,000 epochs; each of them can become 72 in memory
+MAX_STRUCTURE = 2_000_000  # bytes of all but the tensors: 24,000 epochs; each of them can become 72 in memory
 TENSOR = re.compile("[^/]+/data/")  # the start of the name of a tensor's entry
 PLAIN = (str, int, float, bool, type(None))
 

@@ -15,7 +15,8 @@ from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
 from cloning.training.recipe import Recipe, option_name
 
 MAX_SEED = 2**63 - 1  # torch takes no larger one
-MAX_COUNT = 10**9  # of epochs or images: more than a lifetime of training
+MAX_COUNT = 10**9  # of images in an epoch: more than a lifetime of training
+MAX_EPOCHS = 20_000  # whose losses a model file has room for: see `tensors.MAX_STRUCTURE`
 MAX_BATCH = 10**5  # observations: 56 GB of images
 MAX_REPEATS = 1000  # the report's training keeps as many copies of the rows in memory
 SAVE_SECONDS = 30.0  # between two saved states: the most work that a killed run loses
@@ -68,16 +69,15 @@ class Command(NamedTuple):
 
 # The options that set fields of the recipe, and those of them that have no effect with --robust.
 COPIES = f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}"
-count, any_number = number(int, 1, MAX_COUNT), number(float)
 FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
-    "epochs": (count, "epochs in total; may be raised with --resume"),
+    "epochs": (number(int, 1, MAX_EPOCHS), "epochs in total; may be raised with --resume"),
     "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
     "learning_rate": (number(float, 1e-9, 10), "learning rate of Adam or, with --robust, of Muon"),
     "samples_per_epoch": (
-        count,
+        number(int, 1, MAX_COUNT),
         "smallest number of images in an epoch; a fifth as many observations, at most 4,096, validate it",
     ),
-    "throttle_threshold": (any_number, "without --robust: drop rows with less throttle, 0 to 1"),
+    "throttle_threshold": (number(float), "without --robust: drop rows with less throttle, 0 to 1"),
     "side_correction": (
         number(float, -1, 1),
         "without --robust: steering added to the label of left images, subtracted from right ones'",
