@@ -438,7 +438,7 @@ def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, 
 
     recordings, output, process: as for the options; a run is resumed only if its recipe and its recordings are these.
     """
-    run = Run(recipe, tuple(map(str, recordings)), seed)
+    run = Run(recipe, tuple(map(str, recordings)), int(seed))  # NumPy's could not be saved
     return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))
 
 

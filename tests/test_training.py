@@ -263,7 +263,9 @@ def test_a_programs_arguments_are_checked_as_the_commands(linked, tmp_path, monk
     assert words in capsys.readouterr().err and not (tmp_path / "runs").exists()
 
 
-def test_numpys_numbers_make_a_recipe_that_can_be_saved():
+def test_numpys_numbers_make_a_run_that_can_be_saved(monkeypatch):
+    monkeypatch.setattr(model, "execute", lambda command: command.run.seed)
+    assert type(model.train(REPORT, ["data"], "model.pt", np.arange(2)[1])) is int
     epochs: Any = np.int64(3)
     turn, brightness = (np.float64(0.2), 0.5), np.array([0.4, 1.2])
     ranges: dict[str, Any] = {"turn": turn, "brightness": brightness}
