@@ -197,7 +197,7 @@ def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarra
         lines.append(f"{last} hardly follows the {label_source}: train longer, or record more turns.")
     elif worse:
         lines.append(
-            f"{last} has a larger error than steer 0, because on straights, most of the rows, 0 is nearly right.\n"
+            f"{last} has a larger error than steer 0, which is nearly right on straights.\n"
             f"It follows the {label_source} nevertheless. How well it drives, a replay tells:\n"
             + as_typed("python", "-m", "simulator", "replay", "RECORDING", "--model", path)
         )
