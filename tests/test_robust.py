@@ -178,7 +178,7 @@ def finished(sample_recording, tmp_path_factory):
 
 def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording):
     told, folder = finished
-    assert "lane ahead unknown" in told
+    assert "  repeated, lane ahead unknown  kept" in told
     row = next(line for line in told.splitlines() if line.startswith("total"))
     assert int(row.split()[-1]) == 60 - int(row.split()[-2])
     metres = 2 * recovery.HEADING_CHORD + recovery.LOOKAHEAD  # at the beginning and at the end

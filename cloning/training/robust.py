@@ -28,7 +28,7 @@ def robust(report: Recipe) -> Recipe:
         report,
         name="robust",
         words=Words(
-            dropped="lane ahead unknown",
+            dropped="repeated, lane ahead unknown",
             too_few="the drives are too short, or not faster than 2 mph",
             label_source="recovery steering",
             aimed_at="the lane's centre",
