@@ -139,6 +139,22 @@ def test_a_training_outlives_its_terminal_after_nohup():
     assert signal.signal(signal.SIGHUP, before) == signal.SIG_IGN and not stop.received
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_a_terminal_that_is_closed_while_the_state_is_saved_does_not_end_that(monkeypatch):
+    monkeypatch.setattr(os, "isatty", lambda file: False)  # the test's own stays
+    saved = list[str]()
+
+    def save():
+        signal.raise_signal(signal.SIGHUP)
+        saved.append("state")
+
+    with pytest.raises(Interrupted), StopSignals() as stop:
+        signal.raise_signal(signal.SIGHUP)
+        with stop.at_once(save, alone=True):
+            pytest.fail("it has waited")
+    assert saved == ["state"]
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # --resume, and the models of earlier runs
 

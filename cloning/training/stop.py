@@ -66,6 +66,7 @@ class StopSignals:
                 raise Interrupted(self.received)
             yield
         except Interrupted:
+            self._waiting = False  # a second SIGHUP does not end `save`
             save()
             raise
         finally:
