@@ -228,6 +228,7 @@ def test_it_trains_and_replays_without_what_only_some_systems_have(sample_record
         (["--seed", str(2**64)], "--seed"),
         (["--throttle-threshold", "2"], "--throttle-threshold drops"),
         (["--batch-size", str(10**18)], "at most"),
+        (["--output", "training_progress.json"], "is named for two outputs"),
         (["--output", "runs/a/"], "error: --output runs/a/: is a folder"),
         (["--device", "cuda"], "error: --device cuda: "),
         (["--device", "mps"], "error: --device mps: "),

@@ -60,7 +60,8 @@ class RunFiles:
                 new = [folder for folder in (self.pictures, *self.pictures.parents) if not folder.exists()]
                 stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
-                check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
+                models, figures = (self.last, self.best, self.resume), (self.log, self.losses, self.arguments)
+                check_folders(*map(str, (*models, *figures, self.progress, self.rejected)))
                 if stack.enter_context(claimed(self.last.parent)) is None and sys.platform != "win32":
                     print(f"{self.last.parent}: cannot be locked; start no other run in it")
 
