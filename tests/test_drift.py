@@ -130,6 +130,7 @@ def test_the_last_lines_say_in_words_how_the_network_will_drive():
     assert "2 held-out stretches; 0.40 m by net-best.pt of epoch 1, 2.50 m with the wheels straight ahead" in found
     assert found.endswith("leave the road now and then.")
     assert text(REPORT, epoch(1, 0.1, 0.4)).endswith("stay on the road.")
+    assert "mean of 1 held-out stretch;" in driving([epoch(1, 0.1, 0.4)], REPORT, still[:1], files)
     assert "--robust" in text(REPORT, epoch(1, 0.1, 4.0))
     assert text(ROBUST, epoch(1, 0.1, 4.0)).endswith("leave the road often: train longer, or record more.")
     found = text(ROBUST, epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2))

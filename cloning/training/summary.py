@@ -219,7 +219,7 @@ def driving(history: list[EpochMetrics], recipe: Recipe, still: np.ndarray, file
     return (
         f"\n\nSteered by {files.last.name} for two seconds, from where the driver was, a car is "
         f"{last['val_drift']:.2f} m from {recipe.words.aimed_at}\n"
-        f"(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
+        f"(mean of {plural(len(still), 'held-out stretch', 'held-out stretches')}; {others}).\n{verdict}"
     )
 
 
