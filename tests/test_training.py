@@ -247,10 +247,14 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
 
 def test_frames_that_are_in_two_recordings_are_told(sample_recording, tmp_path, capsys):
     """As those of a part that was exported: what is cut from one stays in the other."""
-    parts = [shutil.copytree(sample_recording, tmp_path / name) for name in ("part", "another")]
+    parts = [shutil.copytree(sample_recording, tmp_path / name) for name in ("part", "an\x1bother")]
+    with open(parts[1] / "driving_log.csv", "a") as log:
+        log.write("no row\n")
     for others in (parts[:1], parts):
         model.read_observations(REPORT, [sample_recording, *others], False)
-        assert "\n54 frames are in more than one of these recordings" in capsys.readouterr().out
+        told = capsys.readouterr().out
+        assert "\n54 frames are in more than one of these recordings" in told and "\x1b" not in told
+    assert "an\\x1bother/driving_log.csv: line 61: left out" in told
     model.read_observations(REPORT, [sample_recording], False)
     assert "more than one" not in capsys.readouterr().out
 

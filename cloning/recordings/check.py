@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, printable
 from cloning.base.files import written_whole
 from cloning.base.progress import progress_bar
 from cloning.recordings.columns import Finding, Rejected
@@ -57,7 +57,7 @@ def check_images(
         except ValueError as error:
             reasons[image] = f"{error}; {REMEDY}"
 
-    title, hidden = f"checking images of {recording.folder.name}", not show_progress or not len(todo)
+    title, hidden = f"checking images of {printable(recording.folder.name)}", not show_progress or not len(todo)
     with ThreadPoolExecutor(threads) as pool, progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar:
         remaining = iter(todo.tolist())
         while part := list(islice(remaining, IMAGES_AT_ONCE * threads)):

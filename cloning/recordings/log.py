@@ -133,7 +133,7 @@ def folders_below(path: Path) -> Iterator[Path]:
 
 def print_findings(recording: Recording) -> None:
     """Print a recording's repairs, cuts, and first five rejected rows of each finding, with file, line and remedy."""
-    path = recording.folder / DRIVING_LOG
+    path, excluded = (printable(str(recording.folder / name)) for name in (DRIVING_LOG, EXCLUDED))
     for repair, (rows, line) in recording.repairs.items():
         are = plural(rows, "row is", "rows are")
         print(f"{path}: line {line}: {repair} ({are} read this way; check that it is meant)")
@@ -145,9 +145,7 @@ def print_findings(recording: Recording) -> None:
             print(f"{path}: … and {len(rejected) - SHOWN_REJECTED} more of this kind")
     for cut, rows in recording.cuts:
         stretch = printable(f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}")
-        print(
-            f"{recording.folder / EXCLUDED}: line {cut.line}: {plural(rows, 'row is', 'rows are')} left out, {stretch}"
-        )
+        print(f"{excluded}: line {cut.line}: {plural(rows, 'row is', 'rows are')} left out, {stretch}")
 
 
 def read_recording(folder: str | Path) -> Recording:

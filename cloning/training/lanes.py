@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 
+from cloning.base.errors import printable
 from cloning.base.outputs import plural
 from cloning.base.table import Column, Table
 from cloning.lane.known import lane_position
@@ -60,7 +61,7 @@ class Lanes(LaneAhead):
             line, count = recording.lines[unsure[0].rows.start], plural(sum(map(len, unsure)), "row")
             told = f"the lane is not seen for certain; in {count} from here on, the driven path counts as its centre"
             remedy = "if it is far from it, cut them; if steering, speed or images are wrong, mend them"
-            print(f"{recording.folder / DRIVING_LOG}: line {line}: {told}: {remedy}", flush=True)
+            print(printable(f"{recording.folder / DRIVING_LOG}: line {line}: {told}: {remedy}"), flush=True)
         for stretch in pieces:
             rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
             ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])

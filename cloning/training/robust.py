@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator, default_rng
 
+from cloning.base.errors import printable
 from cloning.network.network import CROP, SEEN_SHAPE
 from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import CheckedRecording
@@ -80,7 +81,7 @@ def robust(report: Recipe) -> Recipe:
 def select_known_lane(recording: CheckedRecording, recipe: Recipe) -> Observations:
     """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
     is_known = (recording.folder / LANE_FILE).exists()
-    print(f"{'reading' if is_known else 'estimating'} the lane in {recording.folder}", flush=True)
+    print(f"{'reading' if is_known else 'estimating'} the lane in {printable(str(recording.folder))}", flush=True)
     recording = recording.without_copies()  # each would end a stretch
     all_lanes = Lanes.of(recording)
     rows = np.flatnonzero(all_lanes.known)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, printable
 from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import as_typed, plural
 from cloning.base.progress import Bar
@@ -50,7 +50,7 @@ class Counts(NamedTuple):
         """Return the counts of a checked recording; kept: number of its rows that are kept."""
         usable, cut = len(recording), sum(rows for _, rows in recording.cuts)
         unusable = recording.rows_read - cut - usable
-        return cls(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
+        return cls(printable(str(recording.folder)), recording.rows_read, cut, unusable, usable - kept, kept)
 
     def too_few(self, needed: int, dropped: str) -> str:
         """Return that too few rows are kept, and the main reason; dropped: why `Recipe.select` drops rows."""
