@@ -313,7 +313,7 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     damaged = sorted((copied / "IMG").glob("left*"))[3]
     damaged.write_bytes(damaged.read_bytes()[:1000])
     told = trained(copied, *TINY, "--output", tmp_path / "model.pt")
-    assert f"line 4: left out: IMG/{damaged.name}: cut short" in told
+    assert f"line 4: left out: IMG/{damaged.name}: cut short" in told and "\n1 unusable line left out" in told
     header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
     assert header == "file,line,finding,detail" and damaged.name in row
     summary.list_rejected([], tmp_path / "rejected_rows.csv")

@@ -88,7 +88,7 @@ def sizes(rows: int, observations: int, validation: int) -> str:
 def refuse_rejected(recordings: Iterable[Recording]) -> None:
     """Raise RecordingError if a recording has unusable rows."""
     if rejected := _rejected(recordings):
-        (path, line, _, detail), count = rejected[0], plural(len(rejected), "unusable row")
+        (path, line, _, detail), count = rejected[0], plural(len(rejected), "unusable line")
         raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {count})")
 
 
@@ -96,7 +96,7 @@ def list_rejected(recordings: Iterable[Recording], file: Path) -> None:
     """Write the unusable rows of all recordings to a csv file, or delete it if there are none. Raises OSError."""
     if rejected := _rejected(recordings):
         write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
-        print(f"{plural(len(rejected), 'unusable row')} left out; {file} lists them")
+        print(f"{plural(len(rejected), 'unusable line')} left out; {file} lists them")
     else:
         file.unlink(missing_ok=True)  # an earlier run's
 
