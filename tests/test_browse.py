@@ -180,6 +180,8 @@ def test_recordings_become_one_with_each_drive_as_it_was(linked, tmp_path):
     parts = [recording.take(slice(0, 20)), recording.take(slice(20, 40)), recording.take(slice(15, 25))]
     days = ["lake is put 1 day later, after another drive", "lake is put 2 days later, after another drive"]
     assert write_part(parts, tmp_path / "one") == days
+    near = [recording.take(slice(0, 1), time=np.array([second])) for second in (0.0, 1.0)]  # which is no break yet
+    assert write_part(near, tmp_path / "near") == days[:1]
     one = read_recording(tmp_path / "one")
     assert (one.steering == np.concatenate([part.steering for part in (parts[0], parts[2], parts[1])])).all()
     assert not one.repairs and not one.rejected and one.path(20).samefile(recording.path(15))

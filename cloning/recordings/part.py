@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from datetime import timedelta
-from math import ceil, inf
+from math import floor, inf
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +47,7 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
     recordings = sorted(recordings, key=lambda recording: float(recording.time[0]))
     renamed, notes, end = list[dict[str, str]](), list[str](), -inf
     for recording in recordings:
-        days = ceil(max(0.0, (end + DRIVE_GAP - recording.time[0]) / DAY.total_seconds()))
+        days = floor(max(-1.0, (end + DRIVE_GAP - recording.time[0]) / DAY.total_seconds())) + 1
         end = recording.time[-1] + (days * DAY).total_seconds()
         renamed.append(_renamed(recording, days, check=len(recordings) > 1))
         if days:
