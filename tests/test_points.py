@@ -53,6 +53,10 @@ def test_an_open_road_begins_and_ends_at_its_ends_and_goes_on_straight_beyond(di
     assert track.starts == {"training": 0.0, "autonomous": 0.0}
 
 
+def test_points_that_are_millimetres_apart_are_thinned_out_and_their_road_is_as_long():
+    assert Track(make_road([(0.005 * i, 0) for i in range(8001)])).length == pytest.approx(40, abs=0.01)
+
+
 def test_forms_of_a_file_give_the_same_road(tmp_path):
     files = {
         "a.csv": "x,y\n0,0\n30,0\n55,8\n80,30\n",

@@ -59,8 +59,11 @@ def make_road(
     bends within its own width, is too short, too long or too steep, and for values that are not as described.
     """
     numbers = _numbers(points)
-    near = np.linalg.norm(np.diff(numbers, axis=0), axis=1) < SAME_POINT
-    numbers = np.delete(numbers, np.flatnonzero(near) + 1, axis=0)
+    kept = numbers[:1].tolist()
+    for point in numbers[1:].tolist():  # from the last one that is kept: else a chain of near points would vanish
+        if math.dist(kept[-1], point) >= SAME_POINT:
+            kept.append(point)
+    numbers = np.array(kept).reshape(-1, 3)
     ends_meet = len(numbers) > 2 and bool(np.linalg.norm(numbers[0] - numbers[-1]) < SAME_POINT)
     if ends_meet and closed is not False:
         numbers = numbers[:-1]
