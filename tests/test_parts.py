@@ -259,6 +259,12 @@ def test_a_short_drive_that_turns_otherwise_than_it_steers_is_not_certain(lake):
     assert np.isnan(placed(recording, lake[1][:300])).all()
 
 
+def test_rows_of_hardly_any_metres_are_not_placed(lake):
+    """As where time stamps count the frames in milliseconds."""
+    recording = lake[0].take(slice(0, 300), time=np.arange(300) / 1000, speed=np.full(300, 10, np.float32))
+    assert np.isnan(placed(recording, lake[1][:300])).all()
+
+
 def test_of_two_parts_as_good_as_each_other_none_is_certain():
     states = np.stack([np.arange(300.0), np.zeros(300), np.zeros(300)], axis=1)
     part, near, far, worse = (

@@ -101,7 +101,8 @@ def candidate_positions(follower: TrackFilter, first: int = 0) -> list[tuple[flo
     local minima of the deviation.
     """
     driven = np.r_[0, np.cumsum(follower.step[first:])]
-    wanted = np.arange(0, min(PROFILE_LENGTH, driven[-1]), PROFILE_STEP)
+    # Two points at least: a single one deviates nowhere, and so has no minima.
+    wanted = np.arange(0, np.clip(driven[-1], 2 * PROFILE_STEP, PROFILE_LENGTH), PROFILE_STEP)
     heading = np.interp(wanted, driven, np.r_[0, np.cumsum(follower.turn[first:])])
     track = follower.track
     n = round(track.length / PROFILE_STEP)
