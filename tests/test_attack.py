@@ -11,7 +11,7 @@ import time
 from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import warm
@@ -303,3 +303,9 @@ def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch
     monkeypatch.setattr(soak, "MAX_GROWTH", -1000.0)
     (fault,) = soak.soak(server, tmp_path, 10)
     assert re.fullmatch(r"memory grew by -?\d+ MB", fault)
+
+
+def test_a_soak_counts_an_answer_that_a_car_does_not_get_and_goes_on(server, tmp_path, monkeypatch):
+    timed = Mock(wraps=soak.timed, side_effect=[*[DEFAULT] * 20, ConnectionError, *[DEFAULT] * 19])
+    monkeypatch.setattr(soak, "timed", timed)
+    assert soak.soak(server, tmp_path, 40) == ["1 answers lost"]

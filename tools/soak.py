@@ -113,7 +113,7 @@ def soak(server: Target, folder: Path, count: int) -> list[str]:
     def new_car() -> Car:
         return Car(server.port, jpegs, expected)
 
-    car, leaves, wrong = new_car(), 0, 0
+    car, leaves, wrong, lost = new_car(), 0, 0, 0
     print(head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms"), flush=True)
     car.ask(car.messages[0])  # so that its frames' file is open, too
     time.sleep(SETTLE)
@@ -129,10 +129,14 @@ def soak(server: Target, folder: Path, count: int) -> list[str]:
                     car, leaves = new_car(), n + 1 + int(random.expovariate(1 / STAY))
                 if n == count // (2 * TENTHS):
                     early = Reading(server)
-                is_right, passed = timed(car, n)
+                bar.update()
+                try:
+                    is_right, passed = timed(car, n)
+                except OSError:  # it comes again
+                    lost, leaves = lost + 1, n + 1
+                    continue
                 wrong += not is_right
                 times.append(passed)
-                bar.update()
             now, answered = Reading(server), len(times) + company.answered - others
             spent = 1000 * (now.seconds - before.seconds) / answered
             p50, p99 = np.quantile(times, (0.5, 0.99))
@@ -143,9 +147,9 @@ def soak(server: Target, folder: Path, count: int) -> list[str]:
     until = time.monotonic() + LEFT_OPEN
     while (files := server.open_files()) != alone and time.monotonic() < until:
         time.sleep(0.1)
-    lost, grown = company.asked - company.answered, before.memory - early.memory
+    grown = before.memory - early.memory
     car.simulator.socket.close()
-    wrong += company.wrong
+    lost, wrong = lost + company.asked - company.answered, wrong + company.wrong
     found = {
         f"{lost} answers lost": lost > 0,
         f"{wrong} answers wrong": wrong > 0,
