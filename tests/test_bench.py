@@ -2,8 +2,11 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 from commands import python
 
 import model
@@ -18,6 +21,9 @@ def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording
     assert bench_training.main([str(sample_recording), "--part", "ab", "--samples", "150"]) == DONE
     measured = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert set(measured["rates"]) == {"a", "b"} and min(measured["rates"].values()) > 0
+    if sys.platform == "linux":
+        peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
+        assert peak and bench_training.peak_memory() == pytest.approx(1024 * int(peak[1]) / 1e9, rel=0.005)
 
 
 def test_the_operations_are_those_of_the_network():

@@ -187,8 +187,8 @@ def peak_memory() -> float:
         return 0.0
     import resource
 
-    unit = 1e9 if sys.platform == "darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
 
 
 def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> None:
