@@ -209,7 +209,7 @@ def pixelated(image: np.ndarray, scale: float, seed: int, frame: Generator) -> n
 
 
 def occluded(image: np.ndarray, covered: float, seed: int, frame: Generator) -> np.ndarray:
-    """Cover a share of the view with three boxes that stay where they are."""
+    """Cover a share of the view, less where they overlap, with three boxes that stay where they are."""
     drive, changed, (rows, columns) = _drive(seed), image.copy(), image.shape[:2]
     for _ in range(3):
         height = min(1, np.sqrt(covered / 3) * np.exp(drive.uniform(-0.5, 0.5)))
@@ -272,7 +272,7 @@ KINDS = {
     "colour": Kind(colour, (20, 40, 70, 110, 170), "turn of the hue, degrees"),
     "jpeg": Kind(jpeg, (30, 18, 15, 8, 3), "quality"),
     "pixelated": Kind(pixelated, (0.6, 0.5, 0.4, 0.25, 0.13), "scale"),
-    "occluded": Kind(occluded, (0.06, 0.12, 0.2, 0.32, 0.45), "share of the view that is covered"),
+    "occluded": Kind(occluded, (0.06, 0.12, 0.2, 0.32, 0.45), "share of the view that boxes cover without overlap"),
     "shifted": Kind(shifted, (4, 8, 14, 20, 28), "pixels, in any direction"),
     "turned": Kind(turned, (2, 5, 9, 14, 20), "degrees"),
     "shaken": Kind(shaken, (1.5, 3, 6, 9, 14), "standard deviation, pixels"),
