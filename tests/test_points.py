@@ -98,6 +98,7 @@ REFUSED = [
     ({"points": [(0, 0)]}, "1 different points; a road needs 2"),
     ({"points": []}, "0 different points"),
     ({"points": [(0, 0), (30, 0), (0, 0)]}, "2 different points; a road needs 2, and a closed one 3"),
+    ({"points": [(0, 0), (60, 0), (30, 50), (0, 0)], "closed": False}, "needs 9 m$"),
     ({"points": [(0, 0, 0), (30, 0, 20)]}, "too steep"),
     ({"points": [(0, 0), (math.nan, 0)]}, "point 2 is"),
     ({"points": [(0, 0), (5e6, 0)]}, "point 2 is"),

@@ -91,7 +91,7 @@ def make_road(
             break
     if reason and checked:
         steps = np.linalg.norm(np.diff(flat, axis=0), axis=1)
-        if not closed and np.linalg.norm(flat[0] - flat[-1]) <= 2 * steps.max():
+        if not (closed or ends_meet) and np.linalg.norm(flat[0] - flat[-1]) <= 2 * steps.max():
             reason += "; if it is a loop, repeat the first point at the end"
         raise TrackError(reason)
     return road
