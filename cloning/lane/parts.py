@@ -240,7 +240,7 @@ class Placing:
         # A mishap lies between two parts of a stretch, or stops the car; else the frames may be cut where the stretch
         # ends, and its last rows be of another road.
         stretch = self.followers[part.stretch].stretch
-        speed = np.abs(self.recording.speed[stretch.rows])[part.start : part.end]
+        speed = self.recording.speed[stretch.rows][part.start : part.end]
         others = [each for each in self.parts if each.stretch == part.stretch]
         may_cut = (
             any(each.end <= part.start for each in others) or speed[:LONGEST_END].min() < STOPS,
@@ -299,7 +299,7 @@ class Placing:
         rows = slice(min(inside, outside), max(inside, outside) + 1)
         pause = np.diff(recording.time[rows])
         drives = (pause >= 0) & (pause <= MAX_PAUSE)
-        speed = np.abs(recording.speed[rows].astype(float)) * MPH
+        speed = recording.speed[rows].astype(float) * MPH
         return float((np.maximum(speed[1:], speed[:-1]) * pause)[drives].sum()), not drives.all()
 
     def near(

@@ -200,7 +200,7 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
     # The path of the rear axle, which slides outwards in bends.
     path, step = heading[:-1] + np.diff(heading) / 2 + stretch.slip, np.diff(stretch.driven)
     right, forward = (np.r_[0.0, np.cumsum(step * function(path))] for function in (np.sin, np.cos))
-    driven = np.r_[0.0, np.cumsum(np.abs(step))]  # also backwards
+    driven = np.r_[0.0, np.cumsum(step)]
     distances = DISTANCES_AHEAD[:FITTED]
     ahead = distances + AXLE_TO_CAMERA
     s, c = np.sin(heading)[:, None], np.cos(heading)[:, None]

@@ -145,7 +145,7 @@ class ReplayedCar:
     def __init__(self, recording: Recording, line: ReferenceLine):
         rows = line.rows
         self.line = line
-        self.speed = np.abs(recording.speed[rows].astype(float)) * MPH  # m/s, the human driver's
+        self.speed = recording.speed[rows].astype(float) * MPH  # m/s, the human driver's
         self.human_steering = recording.steering[rows].astype(float)
         self.seconds = np.diff(recording.time[rows])
         self.right = self.yaw = 0.0

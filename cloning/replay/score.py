@@ -92,7 +92,7 @@ def reference_metrics(recording: Recording, lines: list[ReferenceLine], asked: s
             for start, end in runs
             if why[start]
         ],
-        "mean_speed_mph": round(float(np.abs(recording.speed[driven]).mean()), 1),
+        "mean_speed_mph": round(float(recording.speed[driven].mean()), 1),
     }
 
 

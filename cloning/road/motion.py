@@ -120,7 +120,7 @@ def stretches(recording: "Recording") -> list[Stretch]:
 
 def stretch_rows(recording: "Recording") -> list[slice]:
     """Return the rows of each of a recording's `stretches`."""
-    speed = np.abs(recording.speed.astype(float)) * MPH
+    speed = recording.speed.astype(float) * MPH
     pause = np.diff(recording.time)
     steady = np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE)
     moving = speed > MIN_SPEED

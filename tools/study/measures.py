@@ -99,7 +99,7 @@ def replayed(recording: Recording, driver: ModelDriver) -> dict[str, float]:
     found: dict[str, float] = {}
     for done in drive_at_limits(recording, reference_lines(recording), driver, LIMITS, parallel=True):
         limit = done.limit
-        metres = float(np.sum(np.abs(recording.speed[done.row]) * MPH * done.seconds))
+        metres = float(np.sum(recording.speed[done.row] * MPH * done.seconds))
         found[f"autonomy_{limit:g}"] = done.autonomy()
         found[f"replay_distance_{limit:g}"] = float(np.abs(done.offset).mean())
         found[f"metres_per_intervention_{limit:g}"] = metres / max(1, len(done.interventions))
