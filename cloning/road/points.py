@@ -79,7 +79,7 @@ def make_road(
     changes = np.diff(np.vstack([numbers, numbers[:1]]) if closed else numbers, axis=0)
     length, climb = float(np.linalg.norm(changes[:, :2], axis=1).sum()), float(np.abs(changes[:, 2]).sum())
     if not MIN_LENGTH <= length <= MAX_LENGTH:
-        raise TrackError(f"the road is {length:.1f} m long; it must be {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
+        raise TrackError(f"the road is {length:.7g} m long; it must be {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
     if climb > MAX_LENGTH:  # a curve through such points takes any amount of memory
         raise TrackError(f"the road climbs and falls by {climb:.1f} m; it must be {MAX_LENGTH:g} m at most; z is in m")
     road = PointRoad(name, numbers, float(width), marking, land, closed)
