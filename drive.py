@@ -310,17 +310,17 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
 
     argument, folder: of the command line. Raises UserError if the only argument is probably meant as the folder.
     """
+    usual = DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
     if argument is None:
-        return DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
+        return usual
     if argument.suffix in KERAS:
         raise UserError(
             f"{argument}: a model of Keras, which PyTorch can't read; `python model.py` trains one that drives"
         )
     if folder is None and not argument.is_file() and argument.suffix != ".pt":
-        model = DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
+        command = as_typed("python", "drive.py", usual, argument)
         raise UserError(
-            f"{argument}: not a model file; name the model first and the folder for the frames second: "
-            f"`{as_typed('python', 'drive.py', model, argument)}`"
+            f"{argument}: not a model file; name the model first and the folder for the frames second: `{command}`"
         )
     return argument
 

@@ -409,19 +409,18 @@ def prepare(command: Command) -> Prepared:
 def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
+    plain = training_run.recipe.name != ROBUST.name  # the layers are shown, as in the report
     if ranks.first:
         summary.list_rejected(training_run.training.recordings, training_run.files.rejected)  # not of a refused run
-        layers = training_run.recipe.name != ROBUST.name  # the report shows them, and so does each run's own
-        print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks, layers))
+        print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks, plain))
         training_run.checkpoint.begin(training_run.progress, training_run.precision, training_run.training.steering)
     try:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            following = f"next: {as_typed('python', 'drive.py', training_run.files.last)}"
-            if training_run.recipe.name != ROBUST.name:
-                following += "\n`python model.py --robust` trains a network that drives better"
-            print(program.in_commands(f"{training_run.summary()}\n\n{following}"))
+            following = as_typed("python", "drive.py", training_run.files.last)
+            better = "\n`python model.py --robust` trains a network that drives better" if plain else ""
+            print(program.in_commands(f"{training_run.summary()}\n\nnext: {following}{better}"))
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 
