@@ -29,6 +29,8 @@ FARTHEST = 6.0
 STEPS, CLOSE = 5, 1e-3  # in which a movement is found, and the gain of correlation in one that ends the search
 CAMERA_BEFORE = camera_position(np.zeros(2), forward_vector(0.0))  # m right and forward, from the axle then
 
+Pose = tuple[float, float, float]  # m to the right, m forward and radians to the right, of the camera since a frame
+
 
 class Average:
     """The mean of one drive's noisy frames, which it is given one after the other."""
@@ -65,9 +67,6 @@ class Average:
         return self.mean
 
 
-Pose = tuple[float, float, float]  # m to the right, m forward and radians to the right, of the camera since a frame
-
-
 def _noise(before: np.ndarray, now: np.ndarray, pose: Pose) -> float:
     """Return by how much a frame's ground differs from what the one before lets expect, of its contrast; in grey.
 
@@ -78,13 +77,16 @@ def _noise(before: np.ndarray, now: np.ndarray, pose: Pose) -> float:
     if noise > LEAST:
         movement = _movement(expected, seen)
         if movement is None:
-            return 0.0
+            return 0.0  # the camera was shaken: what differs is no noise
         noise = _difference(_moved(expected, movement), seen)
     return min(1.0, noise)
 
 
 def _expected(before: np.ndarray, now: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ground as the frame before lets it expect, and as a frame shows it: grey, few pixels."""
+    """Return the ground as the frame before lets it expect, and as a frame shows it: grey, few pixels.
+
+    before, now: uint8 (160, 320, 3). Returns two pictures, uint8 (35, 160): every second column, and row of `ROWS`.
+    """
     seen = cv2.cvtColor(np.ascontiguousarray(now[ROWS][::EVERY, ::EVERY]), cv2.COLOR_RGB2GRAY)
     grey = cv2.cvtColor(before, cv2.COLOR_RGB2GRAY)
     to_few = TO_FEW @ homographies(*pose)[0]
@@ -92,11 +94,12 @@ def _expected(before: np.ndarray, now: np.ndarray, pose: Pose) -> tuple[np.ndarr
 
 
 def _difference(expected: np.ndarray, seen: np.ndarray) -> float:
+    """Return by how much two grey pictures of the ground differ, of the contrast of the second."""
     return float(np.median(cv2.absdiff(expected, seen)) / (seen.std() + 1))
 
 
 def _movement(expected: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
-    """Return the matrix, (2, 3), from a frame's few pixels to those that are expected: a turn and a movement.
+    """Return the matrix, (2, 3), from `_expected`'s pixels as seen to those that are expected: a turn and a shift.
 
     None if they have moved by more than FARTHEST, or do not show the same.
     """
