@@ -71,6 +71,8 @@ def findings(found: Recording) -> list[tuple[int, Finding]]:
         ["camera_center, camera_left, camera_right,steering,0,0,speed", *usual("IMG/")],
         [HEADER.replace("throttle,brake", ","), *usual()],
         ["ct_path,lt_path,rt_path,steer,throttle,brake,speed,high_level_control", *[x + ",3" for x in usual("IMG/")]],
+        ["Center Image,Left Image,Right Image,Steering Angle,Throttle,Break,Speed", *usual("IMG/")],
+        ["img_center,left_img,right_img_path,steer_angle,throttle,brake,speed", *usual("IMG/")],
         [f",{HEADER}", *[f"{at + 17},{line}" for at, line in enumerate(usual("IMG/"))]],  # 7
         usual(),  # 8
         *map(usual, ("./IMG/", "/IMG/", "IMG_Ori\\", "D:\\montravail\\IMG\\IMG\\", "C:\\Users\\Doe, John\\IMG\\")),  # 9

@@ -37,13 +37,15 @@ MOST_ERRORS = 0.01  # share of a column's values out of range; if there are more
 
 # The whole names that headers have for the columns, without the spaces, underscores and hyphens between words.
 MEANINGS = {
-    **{name: "steering" for name in ("steering", "steeringangle", "steer", "angle")},
-    **{"throttle": "throttle", "gas": "throttle", "brake": "brake", "reverse": "brake", "speed": "speed"},
+    **{name: "steering" for name in ("steering", "steeringangle", "steer", "steerangle", "angle")},
+    **{"throttle": "throttle", "gas": "throttle", "speed": "speed"},
+    **{name: "brake" for name in ("brake", "break", "reverse")},  # many write Break
     **{"ctpath": "center", "ltpath": "left", "rtpath": "right"},
     **{
-        name.format(word): camera
+        name: camera
         for word, camera in {**dict(zip(CAMERAS, CAMERAS, strict=True)), "centre": "center"}.items()
-        for name in ("{}", "{}camera", "camera{}", "{}image", "image{}", "{}path")
+        for image in ("", "camera", "image", "img", "path", "imagepath", "imgpath")
+        for name in (word + image, image + word)
     },
 }
 BETWEEN_WORDS = re.compile(r"(?<=[a-z])[ _-]+(?=[a-z])")
