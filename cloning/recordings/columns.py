@@ -30,7 +30,7 @@ REMEDY = (
 # write 05: it is a half of 0,05.
 NUMBER = re.compile(r"[-+]?(?:(?:\d(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[1-9]\d*(?:\.\d*)?)", re.ASCII)
 WHOLE_NUMBER = re.compile(r"[-+]?\d+(?:[eE][-+]?\d+)?", re.ASCII)  # or half a number, split at a decimal comma
-SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
+SIMULATOR_NUMBER = re.compile(r"-?(?:(0|[1-9]\d*)(\.\d*[1-9])?|[1-9](\.\d*[1-9])?E[-+]?\d+)", re.IGNORECASE | re.ASCII)
 IMAGE = re.compile(r"(center|centre|left|right)([\W\d_]*\.jpe?g)", re.IGNORECASE)  # no letters but these
 FASTEST = 32  # mph: the simulator's car is clamped to 30; the largest speed in 6,706 rows of real recordings is 30.7
 MOST_ERRORS = 0.01  # share of a column's values out of range; if there are more, the column is not what it is taken for
