@@ -103,13 +103,15 @@ def check_names(names: Sequence[str]) -> None:
             remedy = f"convert the images, and name them .jpg, here and in {IMAGE_FOLDER}/"
             raise UnclearRowError(Finding.CAMERAS, f"{name[:MAX_NAME]}: not a JPEG; {remedy}")
         match = IMAGE.fullmatch(name)
-        if not match or match[1].lower().replace("centre", "center") != camera or len(os.fsencode(name)) > MAX_NAME:
+        if not match or len(os.fsencode(name)) > MAX_NAME:
             raise UnclearRowError(
                 Finding.CAMERAS,
                 f"{name[:MAX_NAME]}: not understood as an image of the {camera} camera, such as "
                 f"{camera}_2018_07_16_17_11_43_382.jpg; rename it, here and in {IMAGE_FOLDER}/; if it stands "
                 f"in another camera's column, {REMEDY}",
             )
+        if match[1].lower().replace("centre", "center") != camera:
+            raise UnclearRowError(Finding.CAMERAS, f"{name}: not of the {camera} camera; delete the row, or {REMEDY}")
         moments.add(match[2])
     if len(moments) > 1:
         raise UnclearRowError(
