@@ -258,6 +258,7 @@ def test_two_rows_of_one_image_with_different_steering_are_left_out(log):
     "content, words",
     [
         (b"PK\x03\x04rest", "line 1: an Excel workbook"),  # 17
+        (b"version https://git-lfs.github.com/spec/v1\noid", "line 1: a pointer of Git LFS: run `git lfs pull`"),
         (b"\x00\x05\x16\x07rest", r"line 1: a macOS resource file \(AppleDouble\)"),
         ("\n".join(usual()).encode("utf-16-le"), "line 1: UTF-16 without a byte-order mark; save it as CSV in UTF-8"),
         ("\n".join(usual()).encode("utf-16-be"), "line 1: UTF-16 without a byte-order mark"),

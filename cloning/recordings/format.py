@@ -20,6 +20,8 @@ PROBLEM_AREAS = "-repetitive", "-corrections"
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
 STAMP_LENGTH = 23  # characters of yyyy_MM_dd_HH_mm_ss_fff
 MAX_NAME = 255  # bytes of a file's name
+LFS_POINTER = b"version https://git-lfs"  # so a file begins that Git LFS has not yet put in its place
+NOT_PULLED = "a pointer of Git LFS: run `git lfs pull`"
 
 
 def time_stamp(moment: datetime) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cloning.base.errors import RecordingError
 from cloning.base.frame import FRAME
+from cloning.recordings.format import LFS_POINTER, NOT_PULLED
 
 RULES = 2  # of what a usable image is: counted up when they change, because `check_images` keeps its results
 MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of it
@@ -22,7 +23,7 @@ FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with 
 SCAN_HEADER = 0xDA
 OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
 REMEDY = "put the right JPEG in its place, or delete the row"  # for an image that is missing or unusable
-OTHER_KINDS = {b"\x89PNG": " but a PNG", b"version https://git-lfs": " but a pointer of Git LFS: run `git lfs pull`"}
+OTHER_KINDS = {b"\x89PNG": " but a PNG", LFS_POINTER: f" but {NOT_PULLED}"}
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
 
 

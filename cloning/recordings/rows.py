@@ -26,7 +26,7 @@ from cloning.recordings.columns import (
     is_image,
     number_ranges,
 )
-from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS
+from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, LFS_POINTER, NOT_PULLED, NUMBERS
 
 FOLDER = r'(?:[^,"/\\]*+[/\\])*+'  # of an image; nearly always the same for all three: \1, which is found faster
 # A row as the simulator writes it: nearly all are, so these are read at once.
@@ -64,7 +64,10 @@ def read_lines(path: Path) -> Iterator[str]:
 def _encoding(path: Path) -> str:
     """Return the csv's encoding, judged by its first bytes. Raises RecordingError if it is not text."""
     with open(path, "rb") as file:
-        start = file.read(4)
+        start = file.read(len(LFS_POINTER))
+    if start == LFS_POINTER:
+        raise RecordingError(f"{path}: line 1: {NOT_PULLED}")
+    start = start[:4]
     if start == b"PK\x03\x04":
         raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
     if start == b"\x00\x05\x16\x07":
