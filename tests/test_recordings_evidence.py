@@ -19,12 +19,12 @@ from cloning.recordings.log import read_recording
 CAMERAS = ("center", "left", "right")
 NUMBERS = ("steering", "throttle", "brake", "speed")
 HEADER_NAMES = {
-    "center": ["center", "Center", "camera_center", "ct_path", "centre image"],
+    "center": ["center", "Center", "camera_center", "ct_path", "centre image", "img_center"],
     "left": ["left", "Left", "camera_left", "lt_path"],
     "right": ["right", "Right", "camera_right", "rt_path"],
     "steering": ["steering", "SteeringAngle", "steer", "angle"],
     "throttle": ["throttle", "Throttle"],
-    "brake": ["brake", "Brake", "reverse"],
+    "brake": ["brake", "Brake", "Break", "reverse"],
     "speed": ["speed", "Speed"],
 }
 OTHERS = ["lap", "predicted_steering", "steering_error", "angle_of_car", "target_speed", "throttle_limit", "left_wheel"]
