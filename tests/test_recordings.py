@@ -265,7 +265,7 @@ def test_two_rows_of_one_image_with_different_steering_are_left_out(log):
         (b"", "nothing was recorded; delete the folder .*, or record again"),
         (HEADER.encode() + b"\n\n", "nothing was recorded; delete the folder .*, or record again"),
         (b'"\n', "line 1: neither a row nor a header"),
-        (b"some words\n", "line 1: neither a row nor a header, .* names center never"),
+        (b"<!DOCTYPE html>\n", r"line 1: neither .*: '<!DOCTYPE html>' names none \(is it the right file\?\); correct"),
         ("\n".join(usual()).encode() + bytes(4 << 20), "line 4: longer than any row: not a csv"),
     ],
 )

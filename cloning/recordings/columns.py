@@ -144,6 +144,8 @@ def header_columns(line: int, fields: Sequence[str]) -> tuple[tuple[str, ...], b
     if wrong := [f"{name} {'twice' if name in columns else 'never'}" for name in COLUMNS if columns.count(name) != 1]:
         unknown = [repr(field) for field in fields if field and not column_of(field)]
         reason = f"; not understood: {', '.join(unknown)}" if unknown else ""
+        if not any(map(column_of, fields)):
+            wrong, reason = ["none (is it the right file?)"], ""
         raise UnclearLogError(
             f"line {line}: neither a row nor a header, which names each column once: {','.join(fields)[:200]!r} names "
             f"{', '.join(wrong)}{reason[:200]}; correct or delete this line; {REMEDY}",
