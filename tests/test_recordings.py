@@ -178,8 +178,9 @@ def test_a_header_within_a_long_file(log):
         (images(9).replace("jpg", "PNG") + ",0,1,0,9", Finding.CAMERAS, "PNG: not a JPEG; convert the images"),
         (images(9).replace("_", "_" + "1" * 300) + ",0,1,0,9", Finding.CAMERAS, "not understood as an image of the"),
         (f"{images(9)},0.5,1,0,9,0.5", Finding.COLUMNS, "5 numbers where 4 are expected"),  # 13
+        (f"{images(8)},0,1,0,9.5{images(9)},0,1,0,9", Finding.COLUMNS, "two rows in one line; put a line break"),
         (f"{images(9)},0.5,1,0,9,Lake v1.2", Finding.COLUMNS, "name the columns in a header line above the rows"),
-        (f"{images(9)},-0,05,0,5,0,9,25", Finding.COLUMNS, "but the file also has decimal points"),
+        (f"{images(9)},-0,05,0,5,0,9,25", Finding.COLUMNS, "in 1 way, but the file also has decimal points"),
         (f"17,{images(9)},0,1,0,9", Finding.NOT_A_ROW, "3 image names where center, left, right belong"),
     ],
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import RecordingError
+from cloning.base.outputs import plural
 from cloning.recordings.columns import (
     FASTEST,
     NUMBER,
@@ -208,6 +209,8 @@ class RowReader:
             self._with_commas.append((line, names, tokens))
             return
         self._has_points = self._has_points or any("." in token and NUMBER.fullmatch(token) for token in tokens)
+        if any(map(is_image, extra)):  # files are also joined whose last line has no end
+            raise UnclearRowError(Finding.COLUMNS, "two rows in one line; put a line break between them")
         if any(map(str.isdigit, "".join(extra))):
             raise UnclearRowError(
                 Finding.COLUMNS,
@@ -249,7 +252,7 @@ class RowReader:
                 self._lines.append(line)
                 self._texts += [*names, *found[0]]
             else:
-                reason = f"may be four numbers with decimal commas in {len(found)} ways{doubt}"
+                reason = f"may be four numbers with decimal commas in {plural(len(found), 'way')}{doubt}"
                 detail = f"{','.join(tokens)!r} {reason}; write decimal points, or {REMEDY}"
                 self._reject(line, Finding.COLUMNS, detail)
 
