@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from browse_process import LATE
 from browser import LOOKS, decoded, needs_chromium
 from drive_process import ask, live, serving
 
@@ -77,8 +78,9 @@ def test_any_road_that_the_stand_in_names_is_drawn(server, jpegs):
             simulator.drive({**telemetry(jpegs[0]), "stand_in": {**PLACE, "track": track}})
             status, body, _ = ask(server.port, "/road")
             expected: Any = centre_line(track)[:, :2] if track in ("mountain-7", "lake") else []
-            assert status == 200 and len(json.loads(body)) == len(expected)
-            assert np.abs(np.array(json.loads(body)) - expected).max(initial=0) < 0.051
+            found = json.loads(body)
+            assert status == 200 and (found["track"], len(found["points"])) == (track, len(expected))
+            assert np.abs(np.array(found["points"]) - expected).max(initial=0) < 0.051
 
 
 def test_scripts_are_scripts_whatever_the_machine_calls_them(network, monkeypatch):
@@ -354,6 +356,25 @@ def test_each_key_on_the_slider_counts_and_a_stopped_car_stays_until_go(model_fi
         assert shown(server)["set_speed"] == 0
         page.click("#stop")
         page.shows("#answer", "drives at 10.5 mph")
+
+
+@needs_chromium
+def test_the_road_on_the_map_is_the_one_that_the_car_drives_on(server, jpegs, page):
+    """Also if the answer about another one comes later, or the server knew of none yet."""
+    road = "document.querySelector('#map .road').getAttribute('d')?.length"
+    page.open(f"http://127.0.0.1:{server.port}/")
+    page.run("own = fetch; fetch = async () => { fetch = own; return new Response('{}'); }; 0")
+    message = telemetry(jpegs[0], speed="9.0000")
+    with feeding(server.port, {**message, "stand_in": {**PLACE, "track": "lake"}}) as feeder:
+        page.wait(f"{road} > 1000")
+        long = page.run(road)
+        page.run(LATE % "/road")
+        feeder.message = {**message, "stand_in": {**PLACE, "track": "jungle"}}
+        page.wait("late.go")
+        feeder.message = {**message, "stand_in": {**PLACE, "track": "lake"}}
+        page.wait(f"{road} == {long}")
+        page.run("late.go(); new Promise(done => setTimeout(done, 5000))")
+        page.wait(f"{road} == {long}")
 
 
 @needs_chromium

@@ -100,11 +100,11 @@ class Server(Protocol):
 def create_app(server: Server, pause: Pause) -> flask.Flask:
     """Return the web application; pause: the server's.
 
-    `/` is the page, `/live` its figures and pictures as server-sent events, `/road` the centre line of the road that
-    the stand-in simulator names: [[x, y], …] in m. `/browse` leads to the browser of recordings, if it runs. POST to
-    `/set-speed` changes the set speed: {"set_speed": text, mph}; the answer is {"set_speed": number}. POST to `/record`
-    saves frames or does no longer: {"recording": true or false}; the answer is the same. Both answer {"message"} with
-    400 to what can't be done.
+    `/` is the page, `/live` its figures and pictures as server-sent events, `/road` the road that the stand-in
+    simulator names, and its centre line: {"track", "points"}, [[x, y], …] in m. `/browse` leads to the browser of
+    recordings, if it runs. POST to `/set-speed` changes the set speed: {"set_speed": text, mph}; the answer is
+    {"set_speed": number}. POST to `/record` saves frames or does no longer: {"recording": true or false}; the answer is
+    the same. Both answer {"message"} with 400 to what can't be done.
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
@@ -133,12 +133,13 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         return flask.Response(events, mimetype="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.get("/road")
-    def road() -> list[list[float]]:
+    def road() -> dict[str, Any]:
         session = server.watched_session()
         if not (session and session.place):
-            return []
+            return {}
+        track = session.place.track
         with one_road:
-            return outline(session.place.track)
+            return {"track": track, "points": outline(track)}
 
     @app.get("/browse")
     def browse() -> Any:

@@ -103,13 +103,14 @@ async function showMap() {
     road = live.track;
     element("track").textContent = `${road}, north is up; the car in red, its last minute in blue`;
     lane.setAttribute("d", "");
-    const points = await fetch("/road").then(answer => answer.json()).catch(() => {
+    const {track, points} = await fetch("/road").then(answer => answer.json()).catch(() => ({}));
+    if (track != live.track) {
       road = undefined; // it is asked for again with the next event
-      return [];
-    });
+      return;
+    }
     const across = [0, 1].map(axis => points.map(point => point[axis] * (axis ? -1 : 1)));
     if (!points.length) {
-      unknown = road;
+      unknown = track;
       element("map").hidden = true;
       return;
     }
