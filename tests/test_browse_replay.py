@@ -244,6 +244,16 @@ def test_spoilt_files_of_a_run_are_named(tmp_path, name, contents, words):
     assert words in found["message"] and "state" not in found
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("name", ["training_arguments.json", "training_progress.json", "training_log.csv"])
+def test_a_pipe_in_place_of_a_runs_file_is_named_and_does_not_hold_up_the_page(tmp_path, name):
+    written_run(tmp_path, finished=1, images=500)
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    [found] = runs.Runs([tmp_path]).found()
+    assert f"{name}: not a regular file" in found["message"]
+
+
 def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resumed(finished, tmp_path):
     shutil.copytree(finished[1], tmp_path / "run")
     files = RunFiles(str(tmp_path / "run" / "model.pt"))

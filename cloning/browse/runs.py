@@ -174,7 +174,7 @@ def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> di
     Raises UserError, OSError.
     """
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(_bytes(path))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
     if isinstance(found, dict) and isinstance(found.get(within), dict):  # an earlier version's has no such part
@@ -186,11 +186,18 @@ def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> di
     return found
 
 
+def _bytes(path: Path) -> bytes:
+    """Return a file's contents. Raises UserError for a pipe, which would never end, and the like; OSError."""
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: not a regular file; delete it, and `python model.py` writes it anew")
+    return path.read_bytes()
+
+
 def _history(path: Path) -> list[dict[str, float]]:
     """Return the finished epochs' metrics in training_log.csv, none if there is no file. Raises UserError, OSError."""
     if not path.exists():
         return []
-    rows = list(csv.DictReader(path.read_text(encoding="utf-8", errors="replace").splitlines()))
+    rows = list(csv.DictReader(_bytes(path).decode(errors="replace").splitlines()))
     try:
         return [
             {name: kind(row[name]) for name, kind in METRICS.items()}
