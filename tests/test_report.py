@@ -131,6 +131,15 @@ def test_the_report_is_written_as_markdown(written):
     assert all((written / picture).stat().st_size for picture in pictures)
 
 
+def test_a_recipe_of_ones_own_is_not_called_the_students(finished, tmp_path):
+    shutil.copytree(finished[1], run := tmp_path / "run")
+    saved = json.loads((run / "training_arguments.json").read_bytes())
+    saved["recipe"]["augmentations"].append("noisy")
+    (run / "training_arguments.json").write_text(json.dumps(saved), encoding="utf-8")
+    page = Report(run).page()
+    assert "own augmentations: noisy" in page and "student" not in page
+
+
 def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
     missing = "no training run in this folder yet"
     file = (written / "training_log.csv", "a file; name the folder that")

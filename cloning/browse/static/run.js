@@ -105,7 +105,7 @@ function update({all, runs}) {
     best: best(run),
     "last epoch": !last ? "none finished yet" : `drift ${metres(last.val_drift)}, ` +
       `validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}`,
-    trained: `${run.robust ? "with --robust" : "as in the report"}, in ${run.folder}`,
+    trained: `${run.robust ? "with" : "without"} --robust, in ${run.folder}`,
     report: run.has_report ? make("a", "report.html", {href: `/runs/${run.id}/report.html`, target: "_blank"})
       : `not written yet: ${run.commands.report}`,
   });
