@@ -118,6 +118,27 @@ def test_a_replay_is_there_no_more_once_one_of_other_cuts_has_taken_its_place(li
         assert recording.details("1")["replays"][0]["state"] == "none"
 
 
+def test_what_a_page_asks_for_again_and_again_is_computed_once(linked, tmp_path, model_file, monkeypatch):
+    """The rows of each cut; and of a comparison all that needs the logs of more recordings than stay in memory."""
+    folders = [linked, *(shutil.copytree(linked, tmp_path / name) for name in "abc")]
+    for folder in folders:
+        add_cuts(folder, Cut(center(folder, 3), center(folder, 5), "off"))
+        steered(folder, model_file)
+        replayed(folder, model_file, 1.0, np.zeros(60), [])
+    with closing(library.Library(folders, [model_file])) as browsed:
+        browsed.analyses.pause()
+        recordings = [browsed[each] for each in browsed.recordings]
+
+        def asked() -> list:
+            return [*(each.compared("1", begin=False) for each in recordings), recordings[0].details("1")]
+
+        first = asked()
+        assert [cut["stretches"] for cut in first[-1]["cuts"]] == [[[3, 6]]] and first[2]["models"][0]["error"]
+        monkeypatch.setattr(library, "read_uncut", None)
+        monkeypatch.setattr(library, "cut_rows", None)
+        assert asked() == first
+
+
 def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, model_file):
     path = read_recording(sample_recording).path(20)
     png = cv2.imdecode(np.frombuffer(attend.picture(path.read_bytes(), str(model_file)), np.uint8), -1)

@@ -142,34 +142,31 @@ class ShownRecording:
 
         Raises RecordingError, UnknownError.
         """
-        recording, cuts = self.read(), read_cuts(self.folder)
+        version = self.version()
+        recording = self.read(version)
         self.analyses.urgent = self.folder
         models = [{"name": name, **self._state(f"model-{at}")} for at, name in enumerate(self.models)]
         shown = self._without_map()
         if "message" in shown:  # a file has changed since
             raise RecordingError(shown["message"])
-        for kind, some, file in (("cuts", cuts, EXCLUDED), ("tags", read_cuts(self.folder, TAGS), TAGS)):
-            covered = cut_rows(self.folder, some, recording.names, recording.images[:, 0], file)
-            shown[kind] = [
-                {**each.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)}
-                for each, rows in zip(some, covered, strict=True)
-            ]
+        for kind, file in (("cuts", EXCLUDED), ("tags", TAGS)):
+            shown[kind] = _covered(self.folder, version, tuple(read_cuts(self.folder, file)), file)[1]
         offset = self.column("offset") if shown["lane"]["state"] == "ready" else None
         steering = [self.column(f"model-{at}") for at, model in enumerate(models) if model["state"] == "ready"]
         return shown | {
             "models": models,
-            "jumps": summary.jumps(recording.steering, offset, steering, ~self._kept(recording)),
+            "jumps": summary.jumps(recording.steering, offset, steering, ~self._kept(version)),
             "limit": limit,
-            "replays": [self._replay(recording, column) for column in self._replays(limit)] if limit else [],
+            "replays": [self._replay(version, column) for column in self._replays(limit)] if limit else [],
         }
 
     def _replays(self, limit: str) -> list[str]:
         return [f"replay-{index}-{limit}" for index in range(len(self.models))]
 
-    def _replay(self, recording: Recording, column: str, begin: bool = False) -> dict[str, Any]:
+    def _replay(self, version: str, column: str, begin: bool = False) -> dict[str, Any]:
         shown = self._state(column, begin, again=begin)
         if shown["state"] == "ready":
-            shown |= replays.figures(self._result(column)[0], recording.images[:, 0])
+            shown |= _driven(self.folder, version, self._analysis(column), shown["stamp"])
         return shown
 
     def replay(self, limit: str, begin: bool) -> None:
@@ -216,6 +213,7 @@ class ShownRecording:
         A stretch is [first row, row after the last, the names of the first's and the last's centre image]. Columns are
         called as on the page: model1, driver1, replay1: the first model's, the last two at a limit. Raises UserError.
         """
+        version = self.version() if version is None else version
         recording = self.read(version)
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}
         for index in range(len(self.models)):
@@ -223,7 +221,7 @@ class ShownRecording:
             if limit:
                 names |= {f"{kind}{index + 1}": f"{kind}-{index}-{limit}" for kind in ("replay", "driver")}
         rows = matching(condition, lambda name: self.column(names[name], version), list(names))
-        rows &= self._kept(recording)
+        rows &= self._kept(version)
         found = stretches_of(rows)
         ends = [[first, end, recording.name(first), recording.name(end - 1)] for first, end in found]
         return {"rows": int(rows.sum()), "stretches": ends}
@@ -236,18 +234,15 @@ class ShownRecording:
         shown, models = self._without_map(), list[dict[str, Any]]()
         if "message" in shown:
             return shown
-        recording = self.read()
-        kept = self._kept(recording)
+        version, cuts = shown["version"], tuple(read_cuts(self.folder))
         if begin:
             self.analyses.resume()
         for at, (name, column) in enumerate(zip(self.models, self._replays(limit), strict=True)):
             steering = self._state(f"model-{at}", begin, again=begin)
             error = None
             if steering["state"] == "ready":
-                difference = (self.column(f"model-{at}") - recording.steering)[kept]
-                known = difference[~np.isnan(difference)]
-                error = float(np.sqrt(np.mean(known**2))) if len(known) else None
-            replay = self._replay(recording, column, begin)
+                error = _error(self.folder, version, cuts, self._analysis(f"model-{at}"), steering["stamp"])
+            replay = self._replay(version, column, begin)
             models.append({"name": name, "steering": steering, "error": error, "replay": replay})
         return shown | {"models": models}
 
@@ -280,9 +275,9 @@ class ShownRecording:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
 
-    def _kept(self, recording: Recording) -> np.ndarray:
+    def _kept(self, version: str) -> np.ndarray:
         """Return the rows that are not cut: bool (n,). Raises RecordingError."""
-        return ~_is_cut(self.folder, read_cuts(self.folder), recording)
+        return ~_covered(self.folder, version, tuple(read_cuts(self.folder)))[0]
 
     def _with_row(self, row: int, version: str | None) -> Recording:
         recording = self.read(version)
@@ -293,7 +288,7 @@ class ShownRecording:
     def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
         """Cut or tag stretches, and return the cuts that were not there. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
-        _is_cut(self.folder, cuts, self.read(), file)  # refuses what is no stretch
+        _covered(self.folder, self.version(), tuple(cuts), file)  # refuses what is no stretch
         return add_cuts(self.folder, *cuts, file=file)
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
@@ -305,12 +300,13 @@ class ShownRecording:
 
         stretches: None for all rows.
         """
+        version = self.version() if version is None else version
         recording = self.read(version)
         stretches = [[0, len(recording)]] if stretches is None else stretches
         chosen = np.zeros(len(recording), bool)
         for first, end in stretches:
             chosen[first:end] = True
-        chosen &= self._kept(recording)
+        chosen &= self._kept(version)
         if not chosen.any():
             raise RecordingError(f"{self.folder}: all of the selection is cut; select other frames")
         return recording.take(chosen)
@@ -341,14 +337,6 @@ class ShownRecording:
             return path.read_bytes()
 
 
-def _is_cut(folder: Path, cuts: Iterable[Cut], recording: Recording, file: str = EXCLUDED) -> np.ndarray:
-    """Return which rows are in a cut, or with TAGS in a tag: bool (n,). Raises RecordingError."""
-    is_cut = np.zeros(len(recording), bool)
-    for rows in cut_rows(folder, cuts, recording.names, recording.images[:, 0], file):
-        is_cut |= rows
-    return is_cut
-
-
 def _read(folder: Path, version: str) -> Recording:
     with _wanted.setdefault(folder, threading.Lock()):  # threads that want the same recording read it once
         return _read_once(folder, version)
@@ -358,6 +346,23 @@ def _read(folder: Path, version: str) -> Recording:
 def _read_once(folder: Path, version: str) -> Recording:
     with _reading:  # one at a time, since each takes memory
         return read_uncut(folder)
+
+
+@functools.lru_cache(maxsize=2 * OPEN)  # thousands of cuts take a second, and a page asks every few
+def _covered(
+    folder: Path, version: str, cuts: tuple[Cut, ...], file: str = EXCLUDED
+) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    """Return which rows are in a cut, or with TAGS in a tag, bool (n,), and each cut with its rows.
+
+    Raises RecordingError.
+    """
+    recording, shown = _read(folder, version), []
+    is_cut = np.zeros(len(recording), bool)
+    covered = cut_rows(folder, cuts, recording.names, recording.images[:, 0], file)
+    for cut, rows in zip(cuts, covered, strict=True):
+        is_cut |= rows
+        shown.append({**cut.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)})
+    return is_cut, shown
 
 
 @functools.lru_cache(maxsize=6 * OPEN)  # 100,000 rows take 3 MB
@@ -376,11 +381,24 @@ def _line_views(folder: Path, version: str, replay: Analysis, now: str, line: in
 @functools.lru_cache(maxsize=1000)  # a few kB each, so that a list of recordings need not be read again
 def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any]:
     recording = _read(folder, version)
-    return summary.figures(recording, _is_cut(folder, cuts, recording))
+    return summary.figures(recording, _covered(folder, version, cuts)[0])
 
 
 @functools.lru_cache(maxsize=1000)
 def _road(folder: Path, version: str, cuts: tuple[Cut, ...], now: str) -> dict[str, Any]:
     recording = _read(folder, version)
-    is_cut = _is_cut(folder, cuts, recording)
-    return summary.road_of(_result(folder, LANE, now), recording.images[:, 0], is_cut)
+    return summary.road_of(_result(folder, LANE, now), recording.images[:, 0], _covered(folder, version, cuts)[0])
+
+
+@functools.lru_cache(maxsize=1000)
+def _error(folder: Path, version: str, cuts: tuple[Cut, ...], analysis: Analysis, now: str) -> float | None:
+    """Return the root mean square of the difference of a model's steering from the driver's; None if it is unknown."""
+    recording = _read(folder, version)
+    difference = _result(folder, analysis, now).column("steering", recording.images[:, 0]) - recording.steering
+    known = difference[~np.isnan(difference) & ~_covered(folder, version, cuts)[0]]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else None
+
+
+@functools.lru_cache(maxsize=1000)
+def _driven(folder: Path, version: str, analysis: Analysis, now: str) -> dict[str, Any]:
+    return replays.figures(_result(folder, analysis, now), _read(folder, version).images[:, 0])
