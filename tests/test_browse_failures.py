@@ -242,3 +242,58 @@ def test_a_recording_is_cut_though_the_browser_stores_nothing(linked, page):
         page.press("z")
         page.shows("#cuts", "None")
     page.send("Page.removeScriptToEvaluateOnNewDocument", **script)
+
+
+def test_nothing_of_a_recording_stays_on_the_page_of_the_next_one(linked, page, tmp_path, model_file):
+    """Neither Pause, nor a condition that was typed at the last moment, nor the names of columns."""
+    models = [shutil.copy(model_file, tmp_path / name) for name in ("one.pt", "two.pt")]
+    other = shutil.copytree(linked, linked.with_name("other"))
+    placed(linked, np.zeros(60))
+    for model in models:
+        steered(other, model)
+    names = "[...document.querySelectorAll('#of option')].map(each => each.text).join()"
+    with browsing(linked, other, "--model", *models) as server:
+        server.answer("/analyses", "DELETE")
+        page.open(f"{server.base}{server.hash('lake')}/0")
+        page.wait(f"{names} == 'steering,throttle,speed,offset,label'")
+        page.press(" ")
+        assert page.text("#play") == "Pause"
+        page.run("own = setTimeout; setTimeout = (action, ms) => { late = action; setTimeout = own; }; 0")
+        page.run("condition.value = 'speed > 1'; condition.oninput()")
+        page.run(f"location.hash = '{server.hash('other')}/7'")
+        at(page, 7)
+        page.wait(f"{names} == 'steering,throttle,speed,model1,model2'")
+        assert page.text("#play") == "Play"
+        page.run("late()")
+        assert page.run("condition.value") == ""
+
+
+def test_a_late_answer_does_not_take_the_place_of_a_newer_one(linked, page):
+    """Of what matched before a cut; and of a comparison before its analyses were begun."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}/7?find=speed > 0&mark=5-9")
+        page.shows("#matches", "60 frames")
+        page.run(LATE % "/matches")
+        page.run("filter.querySelector('input').oninput()")
+        page.wait("late.go")
+        asks_why(page, "x")
+        page.press("Enter")
+        page.shows("#matches", "55 frames")
+        page.run("late.go(); new Promise(done => setTimeout(done, 3000))")
+        assert page.text("#matches") == "55 frames in 2 stretches"
+        page.open(server.base)
+        page.shows("#total", "1 recording")
+        page.run("""late = {}; own = fetch; fetch = async (path, options) => {
+            if (!path.includes('/compared')) return own(path, options);
+            const isBegun = options.method == 'POST', steering = {state: isBegun ? 'waiting' : 'none'};
+            if (!isBegun && !late.go) await new Promise(go => late.go = go);
+            const recording = await (await own(path)).json();
+            const models = [{name: 'one.pt', error: null, steering, replay: steering}];
+            return new Response(JSON.stringify({...recording, models}));
+        }; location.hash = '#/compare'""")
+        page.wait("late.go")
+        page.click("#compare-all")
+        page.shows("#compared", "2 analyses to do")
+        page.run("fetch = () => new Promise(() => {}); late.go(); new Promise(done => setTimeout(done, 3000))")
+        assert page.text("#compared") == "2 analyses to do"

@@ -37,17 +37,18 @@ export async function showComparison(shown) {
 
 async function refresh(now, method) {
   clearTimeout(now.timer);
+  const mine = now.asking = {}; // an answer to an earlier question is dropped
   const again = () => now.timer = setTimeout(() => refresh(now, "GET"), AGAIN);
   let found;
   try {
     found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
   } catch (error) {
-    if (open != now) return;
+    if (open != now || now.asking != mine) return;
     now.lost = true;
     notice(error.message);
     return again();
   }
-  if (open != now) return;
+  if (open != now || now.asking != mine) return;
   if (now.lost) notice();
   now.lost = false;
   const models = found.flatMap(({models = []}) => models);

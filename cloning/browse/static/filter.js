@@ -1,5 +1,5 @@
 // Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
-import {ask, element, histogram, make, many} from "./common.js";
+import {ask, element, histogram, make, many, renew} from "./common.js";
 import {askForReason, marked, showStretches} from "./cuts.js";
 import {askForName} from "./export.js";
 import {page, remember, say} from "./state.js";
@@ -9,18 +9,18 @@ let typing, plot;
 
 // Show the frames that meet the condition in the page's state.
 export async function find() {
-  const now = page.open, {condition} = now, shown = element("matches");
+  const now = page.open, {condition} = now, shown = element("matches"), mine = now.finding = {};
   shown.className = "";
   if (condition) {
     try {
       const query = new URLSearchParams({condition, version: now.details.version, ...now.limit && {limit: now.limit}});
       const found = await ask(`/${now.id}/matches?${query}`);
-      if (page.open != now || now.condition != condition) return;
+      if (page.open != now || now.finding != mine) return;
       now.matches = found;
       shown.textContent = !found.rows ? "no frame"
         : `${many(found.rows, "frame")} in ${many(found.stretches.length, "stretch", "stretches")}`;
     } catch (error) {
-      if (page.open != now || now.condition != condition) return;
+      if (page.open != now || now.finding != mine) return;
       now.matches = undefined;
       shown.textContent = error.message.replace("condition: ", "");
       shown.className = "bad";
@@ -44,7 +44,8 @@ export function setCondition(condition) {
 element("condition").oninput = () => {
   clearTimeout(typing);
   element("cut-matches").disabled = true; // till those of this condition are found
-  typing = setTimeout(() => page.open && setCondition(element("condition").value.trim()), SOON);
+  const now = page.open;
+  typing = setTimeout(() => page.open == now && setCondition(element("condition").value.trim()), SOON);
 };
 element("filter").onsubmit = event => event.preventDefault();
 element("cut-matches").onclick = () =>
@@ -63,7 +64,7 @@ function columns() {
 
 export function showHistogram() {
   const select = element("of"), known = columns(), {of} = page.open;
-  if (select.options.length != known.length) select.replaceChildren(...known.map(([name]) => make("option", name)));
+  renew(select, known.map(([name]) => name), () => known.map(([name]) => make("option", name)));
   select.value = known.some(([name]) => name == of) ? of : "steering"; // until it is known
   const name = select.value, values = known.find(each => each[0] == name)[1];
   const there = values.filter(value => !Number.isNaN(value)), counts = new Array(BINS).fill(0);

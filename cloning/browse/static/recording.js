@@ -3,7 +3,7 @@ import {ask, element, make, many, notice, onClick, renew, request} from "./commo
 import {changes, cutMarked, mark, redo, showCuts, showStretches, undo} from "./cuts.js";
 import {askToExport, find, setCondition, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
-import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
+import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed, stop} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, LIMITS, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
 import {orderButton, note, page, remember, say, TITLES} from "./state.js";
@@ -44,7 +44,7 @@ export function leaveRecording() {
   const now = page.open;
   if (!now) return;
   clearTimeout(now.timer);
-  cancelAnimationFrame(now.playing);
+  stop();
   now.frames.close();
   now.plots.close();
   page.open = undefined;
