@@ -76,6 +76,10 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
     with browsing(linked) as server:
         page.open(server.base)
         page.shows("article .bad", "excluded.csv: line 1")
+        once = "if (!path.includes('/overview')) return own(path); fetch = own; failed = true; throw new Error('gone')"
+        page.run(f"failed = false; own = fetch; fetch = async path => {{ {once}; }}; 0")
+        page.wait("failed")
+        page.wait("document.querySelector('#notice').hidden")
         cuts.unlink()
         page.wait("document.querySelector('article .road')")
         page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")

@@ -3,7 +3,7 @@ import {ask, element, histogram, make, many, notice, onClick, renew, request} fr
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
-const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
+const AGAIN = 3000; // ms until what may have changed is asked for again
 const HEIGHT = 64; // px of a histogram
 const PENDING = ["waiting", "running", "paused"];
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
@@ -40,7 +40,9 @@ export async function showList(state, from) {
   element("cards").replaceChildren(...cards);
   element("finding").hidden = !cards.length;
   await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
-  if (now == shown && document.activeElement == document.body) {
+  if (now != shown) return;
+  follow(now);
+  if (document.activeElement == document.body) {
     element("cards").querySelector(`h2 a[href="#/${from}"]`)?.focus(); // which scrolls there
   }
 }
@@ -146,8 +148,7 @@ async function showRuns(now) {
     });
   } catch (error) {
     if (now != shown) return;
-    lost = true;
-    notice(error.message);
+    tellLost(error);
   }
   if (now == shown) setTimeout(() => now == shown && showRuns(now), AGAIN);
 }
@@ -160,12 +161,25 @@ async function fill(id, card, now) {
   if (now != shown) return;
   const isSame = JSON.stringify(known.get(card)) == JSON.stringify(overview);
   known.set(card, overview);
-  if (!isSame) draw(overview, card);
+  if (isSame) return;
+  draw(overview, card);
   arrange();
-  if (overview.message || PENDING.includes(overview.lane?.state)) {
-    clearTimeout(card.again);
-    card.again = setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
+}
+
+// Ask again, one after the other, for the recordings that cannot be read, or whose lane is being analysed.
+async function follow(now) {
+  const began = performance.now();
+  for (const [card, {id, message, lane}] of known) {
+    if (message || PENDING.includes(lane.state)) await fill(id, card, now).catch(error => now == shown && tellLost(error));
+    if (now != shown) return;
   }
+  setTimeout(() => now == shown && follow(now), Math.max(AGAIN, performance.now() - began)); // there may be thousands
+}
+
+// Once the server answers again, all is shown anew.
+function tellLost(error) {
+  lost = true;
+  notice(error.message);
 }
 
 // What is worth telling besides the figures: what was repaired, refused, cut or tagged.
