@@ -272,6 +272,14 @@ def test_nothing_of_a_recording_stays_on_the_page_of_the_next_one(linked, page, 
         assert page.run("condition.value") == ""
 
 
+def test_runs_of_as_many_epochs_as_there_may_be_are_drawn(page, tmp_path):
+    for name in "ab":
+        written_run(tmp_path / name, 20000, images=0, epochs=20000, losses=[0.1] * 20000, drifts=[0.1] * 20000)
+    with browsing("--run", tmp_path / "a", tmp_path / "b") as server:
+        page.open(f"{server.base}#/run/0?with=1&smooth=0.5")
+        page.wait("document.querySelectorAll('#losses canvas').length == 2")
+
+
 def test_a_late_answer_does_not_take_the_place_of_a_newer_one(linked, page):
     """Of what matched before a cut; and of a comparison before its analyses were begun."""
     placed(linked, np.zeros(60))

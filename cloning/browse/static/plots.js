@@ -251,7 +251,7 @@ export class Plots {
 
 const balanced = (bound, most) => [-Math.min(bound, most), Math.min(bound, most)];
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
-const most = values => values.reduce((high, value) => Math.max(high, value), 0);
+export const most = values => values.reduce((high, value) => Math.max(high, value), 0); // of any number of values
 // uPlot leaves gaps at nulls, which typed arrays do not have.
 const gaps = values =>
   values.some(Number.isNaN) ? Array.from(values, value => Number.isNaN(value) ? null : value) : values;

@@ -1,7 +1,7 @@
 // A training run: how far it is, its drift and losses beside other runs', and the pictures of what it trains on; it
 // refreshes itself.
 import {element, make, many, notice, onClick, renew, request} from "./common.js";
-import {MODEL_COLOURS} from "./plots.js";
+import {MODEL_COLOURS, most} from "./plots.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
 const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
@@ -199,13 +199,13 @@ function draw() {
       return undefined;
     }
     const usual = values => values.toSorted((a, b) => a - b)[Math.ceil(LOSSES * values.length) - 1] ?? 0;
-    const most = curves.flatMap(([[, values], {isWithin}]) => isWithin ? usual(values) : values);
+    const high = most(curves.flatMap(([[, values], {isWithin}]) => isWithin ? usual(values) : values));
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
       legend: {markers: {stroke: (plot, at) => plot.series[at].full ?? plot.series[at].stroke(plot, at)}},
       hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
       scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
-        y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
+        y: {range: [0, high * 1.08 || 0.1]}},
       axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font,
         incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
       series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
