@@ -131,6 +131,13 @@ def test_the_report_is_written_as_markdown(written):
     assert all((written / picture).stat().st_size for picture in pictures)
 
 
+def test_names_are_names_in_markdown_too(tmp_path):
+    cells = "<table><tr><th>a|b</th><td>1</td></tr></table>"
+    command.write_markdown(f"<main><h1>&lt;b&gt;</h1>{cells}<code>a|b</code></main>", tmp_path / "report.md")
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert r"# \<b\>" in text and r"| a\|b | 1 |" in text and "`a|b`" in text
+
+
 def test_a_recipe_of_ones_own_is_not_called_the_students(finished, tmp_path):
     shutil.copytree(finished[1], run := tmp_path / "run")
     saved = json.loads((run / "training_arguments.json").read_bytes())

@@ -28,7 +28,7 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import TrackError, UserError
 from cloning.base.figure import png
-from cloning.base.outputs import claimed, write_json, write_output
+from cloning.base.outputs import claimed, plural, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.generated import LANDS, MARKINGS, PointRoad
@@ -215,7 +215,7 @@ def main(argv: list[str] | None = None) -> int:
             print(row(*("" if value is None else value for value in figures.values())))
         write_json(folder / "search.json", {"options": vars(options) | {"folder": str(folder)}, "searches": searches})
         if failures:
-            title = f"{len(failures)} failures" + f", the first {SHOWN}" * (len(failures) > SHOWN)
+            title = plural(len(failures), "failure") + f", the first {SHOWN}" * (len(failures) > SHOWN)
             write_output(folder / "failures.png", picture(failures[:SHOWN], title))
     same = sum(figures["same_again"] for figures in searches)
     print(f"{same} of {len(failures)} failures were the same, to the last digit, when they were driven again")

@@ -80,7 +80,8 @@ def write_markdown(page: str, path: Path) -> None:
     content = page[page.index("<main>") : page.index("</main>")]
     content = re.sub(r"<source[^>]*>|<video.*?</video>", "", content, flags=re.DOTALL)  # dark twins, films
     content = re.sub(r'data:image/([\w+]+);base64,([^"]+)', saved, content)
-    write(path, markdown_library().markdownify(content, heading_style="ATX", bullets="*").encode(errors="replace"))
+    text = markdown_library().markdownify(content, heading_style="ATX", bullets="*", escape_misc=True)
+    write(path, text.encode(errors="replace"))
 
 
 if __name__ == "__main__":
