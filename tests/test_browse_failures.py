@@ -69,6 +69,31 @@ def test_the_analysis_that_begins_by_itself_can_be_paused(linked, page, tmp_path
         page.shows("#findings", "lateral offset: 0 % analysed. Pause")
 
 
+def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, page):
+    """Also on its link in a comparison."""
+    with browsing(linked) as server:
+        server.answer("/analyses", "DELETE")
+        page.open(server.base)
+        page.shows("article", "paused")
+        page.run("""n = 0; own = fetch; fetch = async (path, options) => {
+            const answer = await own(path, options);
+            if (!path.match(/overview|compared/)) return answer;
+            const lane = {state: 'running', progress: ++n / 1000};
+            const models = [{name: 'one.pt', steering: lane, replay: lane}];
+            return new Response(JSON.stringify({...await answer.json(), lane, models}));
+        }; document.querySelector('article a').focus()""")
+        page.shows("article", "1 % analysed")
+        assert page.run("document.activeElement.textContent") == "lake"
+        page.run("document.querySelector('article input').focus()")
+        page.shows("article", "2 % analysed")
+        assert page.run("document.activeElement.title") == "Select lake"
+        page.run("location.hash = '#/compare'")
+        page.shows("#table", "computing")
+        page.run("document.querySelector('#table a').focus(); n = 49")
+        page.shows("#table", "computing: 5 %")
+        assert page.run("document.activeElement.textContent") == "lake"
+
+
 def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
     placed(linked, np.zeros(60))
     cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")

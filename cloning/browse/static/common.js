@@ -63,13 +63,18 @@ export function histogram(holder, name, counts, [low, high], axis, more) {
   }, [counts.map((_, bin) => low + (bin + 0.5) * wide), counts], holder);
 }
 
-// Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
-// on the button with the same index.
+// Give an element new children, unless they would show the same as before; build: makes them.
 export function renew(holder, content, build) {
   const now = JSON.stringify(content);
   if (holder.shown == now) return;
   holder.shown = now;
-  const focused = [...holder.querySelectorAll("button")].indexOf(document.activeElement);
-  holder.replaceChildren(...build());
-  holder.querySelectorAll("button")[focused]?.focus();
+  refill(holder, build());
+}
+
+// Give an element new children. A focus in them stays: on what has the same index.
+export function refill(holder, children) {
+  const all = () => [...holder.querySelectorAll("a, button, input, [tabindex]")];
+  const focused = all().indexOf(document.activeElement);
+  holder.replaceChildren(...children);
+  all()[focused]?.focus();
 }

@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, histogram, make, many, notice, onClick, renew, request} from "./common.js";
+import {ask, element, histogram, make, many, notice, onClick, refill, renew, request} from "./common.js";
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
@@ -201,7 +201,7 @@ function draw(overview, card) {
   };
   const heading = make("h2", "", {}, make("a", name, {href: `#/${id}`}), ...message ? [] : [box]);
   if (message) {
-    card.replaceChildren(heading, make("p", message, {class: "bad"}));
+    refill(card, [heading, make("p", message, {class: "bad"})]);
     return;
   }
   const src = `/recordings/${id}/rows/${overview.picture}/center.jpg?version=${overview.version}`;
@@ -217,16 +217,17 @@ function draw(overview, card) {
     const [mean, most] = overview.offset.map(metres => metres.toFixed(2));
     lines.push(`${mean} m from the lane's centre, at most ${most} m`);
   }
-  card.replaceChildren(heading, make("div", "", {class: "road"}, picture, ...map(overview)), histogram,
+  const children = [heading, make("div", "", {class: "road"}, picture, ...map(overview)), histogram,
     ...lines.map(line => make("p", line)),
     ...words(overview).length ? [make("p", words(overview).join(", "), {class: "found"})] : [],
-    make("p", overview.folder, {class: "quiet"}));
+    make("p", overview.folder, {class: "quiet"})];
   if (lane.state == "failed") {
     const retry = make("button", "Look for the road again", {title: "Do the analysis again that failed"}), now = shown;
     onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"})
       .then(() => fill(id, card, now)).catch(error => notice(error.message)));
-    card.append(retry);
+    children.push(retry);
   }
+  refill(card, children);
   histograms.get(card)?.destroy();
   histograms.set(card, bars(overview.histogram, histogram));
 }
