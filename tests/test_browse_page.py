@@ -182,6 +182,8 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.look(390, 844)
     page.wait("innerWidth == 390")
     assert page.run("document.querySelector('#where').getBoundingClientRect().bottom") <= 844
+    page.look(320, 844)
+    page.wait("innerWidth == 320 && document.documentElement.scrollWidth <= innerWidth")
 
 
 def test_frames_are_found_cut_together_and_exported(linked, page):
@@ -296,7 +298,7 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
     write_result(gone.folder, LANE, stamp(gone.folder, LANE), analyse.lane(gone))  # else it takes seconds
     (tmp_path / "data/spoilt/driving_log.csv").write_text("x" * 300, encoding="utf-8")
     with browsing(linked.parent, "--run", tmp_path) as server:
-        page.look(390, 844)
+        page.look(320, 844)  # 1280 px at 400 %
         page.open(server.base)
         page.shows("#total", "4 recordings, 121 frames")
         page.shows("#runs", "no training run in this folder yet")

@@ -8,7 +8,7 @@ const COLUMNS = { // of each model, and what they mean
   "mean distance": "While the model drives, from the lane's centre, or from the driver's path where that is not known",
 };
 const AGAIN = 2000; // ms until recordings whose analyses are not done are asked for again
-let open; // {limit, ids, found, timer}
+let open; // {limit, ids, asking, lost, timer}
 
 export function leaveComparison() {
   clearTimeout(open?.timer);
