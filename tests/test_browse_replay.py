@@ -256,6 +256,7 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
         ("training_progress.json", "[]", "training_progress.json: finished is None"),
         ("training_progress.json", '{"finished": -1}', "finished is -1"),
         ("training_log.csv", "epoch,images\n1,2\n", "training_log.csv: not a log of epochs"),
+        ("training_log.csv", "epoch,images,seconds,loss,val_loss\n1,2,nan,1,1\n", "not a log of epochs"),
     ],
 )
 def test_spoilt_files_of_a_run_are_named(tmp_path, name, contents, words):

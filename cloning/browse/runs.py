@@ -146,7 +146,8 @@ def _trail(progress: dict[str, Any], done: float) -> list[list[float]]:
     every, losses, batches = progress.get("trail_every"), progress.get("trail"), progress.get("batches", 0)
     if not (isinstance(every, int) and isinstance(losses, list) and batches):  # of an earlier version
         return []
-    known = [(n, loss) for n, loss in enumerate(losses, 1) if isinstance(loss, float) and n * every <= batches]
+    losses = [loss if isinstance(loss, float) and math.isfinite(loss) else None for loss in losses]
+    known = [(n, loss) for n, loss in enumerate(losses, 1) if loss is not None and n * every <= batches]
     return [[round(n * every / batches * done, 4), loss] for n, loss in known]
 
 
@@ -199,11 +200,14 @@ def _history(path: Path) -> list[dict[str, float]]:
         return []
     rows = list(csv.DictReader(_bytes(path).decode(errors="replace").splitlines()))
     try:
-        return [
+        history = [
             {name: kind(row[name]) for name, kind in METRICS.items()}
             | {"val_drift": float(row.get("val_drift") or "nan")}
             for row in rows
         ]
+        if not all(math.isfinite(row["seconds"]) for row in history):  # a browser reads no nan
+            raise ValueError
+        return history
     except (KeyError, TypeError, ValueError):
         raise UserError(f"{path}: not a log of epochs; `python model.py` writes it anew") from None
 
