@@ -1,6 +1,6 @@
 // What all parts of the page use.
-import {element, make} from "/site/site.js";
-export {element, make};
+import {element, make, palette} from "/site/site.js";
+export {element, make, palette};
 
 // A request's JSON, or bytes if `binary`. What is thrown has the server's message.
 export const ask = (path, options) => request(`/recordings${path}`, options);
@@ -48,16 +48,15 @@ export const told = words => ({"aria-label": words, title: words});
 
 // A histogram of counts in equal bins from low to high, drawn by uPlot; axis, more: options of its axis and the plot.
 export function histogram(holder, name, counts, [low, high], axis, more) {
-  const colours = getComputedStyle(document.body), wide = (high - low) / counts.length;
+  const {colour, axis: usual} = palette(), wide = (high - low) / counts.length;
   holder.setAttribute("role", "img");
   holder.setAttribute("aria-label", `Histogram of ${name}, on a square-root scale`);
   return new uPlot({
     legend: {show: false},
     scales: {x: {time: false, range: [low, high]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
       range: (_, least, most) => [0, Math.max(1, most)]}},
-    axes: [{stroke: colours.getPropertyValue("--quiet"), grid: {show: false}, ticks: {show: false},
-      font: "12px system-ui, sans-serif", ...axis}, {show: false}],
-    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false},
+    axes: [{...usual, grid: {show: false}, ...axis}, {show: false}],
+    series: [{}, {fill: colour("--line"), width: 0, points: {show: false},
       paths: uPlot.paths.bars({size: [0.9, 100]})}],
     ...more,
   }, [counts.map((_, bin) => low + (bin + 0.5) * wide), counts], holder);

@@ -1,6 +1,6 @@
 // The curves of a recording, one above the other, over its rows; drawn by uPlot.
 import {element, make} from "./common.js";
-import {rounded} from "/site/site.js";
+import {palette, rounded} from "/site/site.js";
 import {showWindow, zoomable} from "./zoom.js";
 
 // Told apart by the colour-blind, too.
@@ -63,7 +63,7 @@ export class Plots {
     if (this.held) return;
     this.plots?.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
-    const {steering, throttle, speed, offset, label} = this.columns, colours = getComputedStyle(document.body);
+    const {steering, throttle, speed, offset, label} = this.columns, {colour} = palette();
     const models = this.models.map((name, index) =>
       ({name, values: this.columns[`model-${index}`], colour: MODEL_COLOURS[index % MODEL_COLOURS.length]}));
     const replays = this.replays.map((replay, index) => replay && ({...models[index], values: replay.offset,
@@ -71,8 +71,8 @@ export class Plots {
     const drivers = this.replays.map((replay, index) => replay &&
       ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
     const isAlwaysKnown = this.replays.every(replay => !replay || replay.by_lane == replay.driven);
-    const human = {name: "driver", values: steering, colour: colours.getPropertyValue("--line")};
-    const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label"),
+    const human = {name: "driver", values: steering, colour: colour("--line")};
+    const taught = label ? [{name: "label", values: label, colour: colour("--label"),
       title: "The recovery steering, which model.py --robust learns"}] : [];
     this.steerings = {human, taught, models};
     const graphs = [
@@ -94,7 +94,7 @@ export class Plots {
   }
 
   plot({title, unit, digits, range, curves, lines = [], tall, isLast}) {
-    const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
+    const {colour, axis} = palette();
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), holder = make("div");
     for (const curve of curves) {
       curve.colour ??= colour("--line");
@@ -106,8 +106,6 @@ export class Plots {
     figure.append(caption, holder);
     element("plots").append(figure);
     const here = make("div", "", {class: "here"}), limits = lines.flatMap(metres => [-metres, metres]);
-    const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
-      grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
     const fits = (plot, metres, [low, high]) => metres / (high - low) * (plot.height - TIMES) > LABEL;
     const metres = {splits: (plot, _, ...scale) => [0, ...limits.filter(limit => fits(plot, Math.abs(limit), scale))], values: (_, at) => at.map(each => each ? `${each} m` : "0")};
     const plot = new uPlot({
@@ -169,20 +167,20 @@ export class Plots {
   // The interventions of the curves are ticks in their colours, which leave the curves to be seen where there are many.
   // Lines at the limits, dashed: where a human would take over, and where the road ends.
   shade(plot, curves, limits) {
-    const {ctx, bbox} = plot, colours = getComputedStyle(document.body), px = uPlot.pxRatio; // of the canvas, in one of CSS
+    const {ctx, bbox} = plot, {colour: named} = palette(), px = uPlot.pxRatio; // of the canvas, in one of CSS
     ctx.save();
     ctx.globalAlpha = 0.25;
     for (const [first, end, colour] of this.stretches) {
       const left = Math.max(bbox.left, plot.valToPos(first - 0.5, "x", true));
       const right = Math.min(bbox.left + bbox.width, plot.valToPos(end - 0.5, "x", true));
-      ctx.fillStyle = colours.getPropertyValue(colour);
+      ctx.fillStyle = named(colour);
       if (right > left) ctx.fillRect(left, bbox.top, Math.max(px, right - left), bbox.height);
     }
     ctx.globalAlpha = 0.7;
     for (const metres of limits) {
       const at = Math.round(plot.valToPos(metres, "y", true)) + px % 2 / 2;
       if (at < bbox.top || at > bbox.top + bbox.height) continue;
-      ctx.strokeStyle = colours.getPropertyValue(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark");
+      ctx.strokeStyle = named(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark");
       ctx.lineWidth = px; // on a phone, the grid would hide a thinner one
       ctx.setLineDash([5 * px, 4 * px]);
       ctx.beginPath();

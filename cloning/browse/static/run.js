@@ -1,6 +1,6 @@
 // A training run: how far it is, its drift and losses beside other runs', and the pictures of what it trains on; it
 // refreshes itself.
-import {element, make, many, notice, onClick, renew, request} from "./common.js";
+import {element, make, many, notice, onClick, palette, renew, request} from "./common.js";
 import {MODEL_COLOURS, most} from "./plots.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
@@ -167,11 +167,8 @@ function smoothed([[epochs, values], looks]) {
 
 // Drift and losses by epoch, of all runs, and the losses within the epochs.
 function draw() {
-  const {runs, plots} = open, colours = getComputedStyle(document.body);
-  const colour = name => colours.getPropertyValue(name), good = colour("--good");
+  const {runs, plots} = open, {colour, axis} = palette(), good = colour("--good");
   plots.forEach(plot => plot.destroy());
-  const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
-    grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
   const [drift, losses] = [[], []]; // [epochs, values], and the curve's looks
   runs.forEach((run, at) => {
     const {history, trail, best} = run, stroke = at ? MODEL_COLOURS[(at - 1) % MODEL_COLOURS.length] : colour("--line");

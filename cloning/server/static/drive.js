@@ -1,5 +1,5 @@
 // The page of drive.py: what it does in words, its figures, and curves of the last minute.
-import {element, make, rounded} from "./site.js";
+import {element, make, palette, rounded} from "./site.js";
 
 const {seconds, topSpeed, limits} = element("plots").dataset;
 const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.parse(limits); // s, mph, m
@@ -204,10 +204,8 @@ class Graph {
 
   build() {
     this.plot?.destroy();
-    const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
-    const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif", ticks: {show: false},
-      grid: {stroke: colour("--edge"), width: 0.5}};
-    const curve = {width: 1.25, points: {show: false}}, limit = this.isDistance ? LIMITS.at(-1) : 0;
+    const {colour, axis} = palette(), curve = {width: 1.25, points: {show: false}};
+    const limit = this.isDistance ? LIMITS.at(-1) : 0;
     this.plot = new uPlot({
       ...this.size(), legend: {show: false}, cursor: {show: false}, padding: [6, RIGHT, 0, 0],
       scales: {x: {time: false, range: [-SECONDS, 0]}, y: {range: () => this.range}},

@@ -10,4 +10,11 @@ export function make(name, text = "", attributes = {}, ...children) {
   return made;
 }
 
+// The page's colours, by their custom properties, and with them the looks of an axis of uPlot.
+export function palette() {
+  const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
+  const grid = {stroke: colour("--edge"), width: 0.5}, font = "12px system-ui, sans-serif";
+  return {colour, axis: {stroke: colour("--quiet"), font, grid, ticks: {show: false}}};
+}
+
 export const rounded = (number, digits) => number.toFixed(digits).replace(/^-(0[.0]*)$/, "$1"); // no -0.00
