@@ -276,6 +276,17 @@ def test_a_pipe_in_place_of_a_runs_file_is_named_and_does_not_hold_up_the_page(t
     assert f"{name}: not a regular file" in found["message"]
 
 
+def test_a_runs_log_is_read_again_only_once_it_has_changed(tmp_path, monkeypatch):
+    files, shown = written_run(tmp_path, finished=4, images=0), runs.Runs([tmp_path])
+    first = shown.run(0)
+    assert "history" not in shown.found()[0], "the list needs none, which may be long"
+    with monkeypatch.context() as patch:
+        patch.setattr(runs, "csv", None)
+        assert shown.run(0)["history"] == first["history"]
+    files.log.write_text(files.log.read_text(encoding="utf-8").replace("0.5", "0.55"), encoding="utf-8")
+    assert shown.run(0)["history"][0]["loss"] == 0.55
+
+
 def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resumed(finished, tmp_path):
     shutil.copytree(finished[1], tmp_path / "run")
     files = RunFiles(str(tmp_path / "run" / "model.pt"))
@@ -323,7 +334,7 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         assert page.run("document.querySelectorAll('#losses .u-series.smoothed').length") == 6, "beside the raw ones"
         average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
         assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
-        run = {"state": "running", "history": [], "epochs": 2, "samples_per_epoch": 100, "images": 50}
+        run = {"state": "running", "finished": 0, "epochs": 2, "samples_per_epoch": 100, "images": 50}
         run |= {"left": 33.2, "age": 30}  # s: it told of itself 30 s ago
         told = page.run(f"import('/static/run.js').then(({{stateOf}}) => stateOf({json.dumps(run)}))")
         assert told == "running: epoch 1 of 2, 50 % of it, 4 s left"

@@ -1,6 +1,7 @@
 """Training runs for the page: how far each is, its losses and its pictures, read from what model.py writes."""
 
 import csv
+import functools
 import json
 import math
 import re
@@ -10,7 +11,7 @@ from typing import Any
 from cloning.base import program
 from cloning.base.errors import UserError, message_of
 from cloning.base.outputs import as_typed, short_names
-from cloning.browse.analyses import UnknownError
+from cloning.browse.analyses import UnknownError, file_stamp
 from cloning.training.run_files import RunFiles, best_epoch, judged_by
 
 PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")
@@ -41,7 +42,7 @@ class Runs:
             if files.arguments.exists() or self.asked:
                 try:
                     known = overview(files)
-                    known = {key: known[key] for key in known.keys() - {"pictures", "trail", "options"}}
+                    known = {key: known[key] for key in known.keys() - {"pictures", "trail", "history", "options"}}
                 except (UserError, OSError) as error:
                     known = {"message": program.in_commands(message_of(error))}
                 shown.append(self._place(index) | known)
@@ -94,7 +95,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
     written = Path(str(options.get("output", files.last))).name or files.last.name  # by the last run
     output = RunFiles(str(files.last.with_name(written)))
-    history = _history(files.log)
+    history = _history(files.log, file_stamp(files.log) if files.log.exists() else None)
     if files.progress.exists():
         progress = _json(files.progress, PROGRESS, 0)
         history = history[: progress["finished"]]  # else those are an earlier run's, or the state comes in a moment
@@ -122,6 +123,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
         "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
         "epochs": epochs,
         "samples_per_epoch": samples,
+        "finished": finished,  # epochs
         # Of each finished epoch METRICS and val_drift.
         "history": [{key: value if math.isfinite(value) else None for key, value in row.items()} for row in history],
         "images": images,  # so far in this epoch, as the loss
@@ -194,9 +196,13 @@ def _bytes(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _history(path: Path) -> list[dict[str, float]]:
-    """Return the finished epochs' metrics in training_log.csv, none if there is no file. Raises UserError, OSError."""
-    if not path.exists():
+@functools.lru_cache(maxsize=100)
+def _history(path: Path, stamp: tuple[int, int] | None) -> list[dict[str, float]]:
+    """Return the finished epochs' metrics in training_log.csv. Raises UserError, OSError.
+
+    stamp: its `file_stamp`, since it is asked for every few seconds; None if there is no file.
+    """
+    if not stamp:
         return []
     rows = list(csv.DictReader(_bytes(path).decode(errors="replace").splitlines()))
     try:

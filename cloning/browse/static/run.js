@@ -61,11 +61,11 @@ function best({best, history, models}) {
 
 const metres = value => value == null ? "–" : `${value.toFixed(2)} m`;
 
-export const stateOf = ({state, commands, history, epochs, samples_per_epoch: samples, images, left, age}) => {
+export const stateOf = ({state, commands, finished, epochs, samples_per_epoch: samples, images, left, age}) => {
   if (state == "finished") return `finished: ${many(epochs, "epoch")}`;
-  const where = `epoch ${Math.min(history.length + 1, epochs)} of ${epochs}`;
+  const where = `epoch ${Math.min(finished + 1, epochs)} of ${epochs}`;
   if (state == "stopped") return `stopped or killed in ${where}; continue with ${commands.resume}`;
-  if (history.length == epochs) return "running: another run reads its recordings, or this one sums up";
+  if (finished == epochs) return "running: another run reads its recordings, or this one sums up";
   const share = (100 * Math.min(1, images / samples)).toFixed(0);
   return `running: ${where}, ${share} % of it` + (left == null ? "" : `, ${duration(Math.max(0, left - age))} left`);
 };
