@@ -26,7 +26,7 @@ from cloning.road.generated import PointRoad
 from cloning.road.motion import FULL_LOCK, MPH
 from cloning.road.points import make_road, parse_track_string
 from cloning.road.track import Track
-from cloning.wire.client import Driven, event_packet, parse_commands
+from cloning.wire.client import USABLE, Driven, event_packet, parse_commands
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
@@ -117,9 +117,7 @@ class Dialect(Driven):
         if answer:
             self.apply(answer)
         else:
-            program.warn_once(
-                'an answer cannot be used: it must have "steering_angle" and "throttle", as texts, such as "0.1"'
-            )
+            program.warn_once(f"an answer cannot be used: it must have {USABLE}")
         return answer is not None
 
     def handle(self, event: str, data: Any) -> bool:

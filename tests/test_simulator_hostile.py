@@ -98,7 +98,7 @@ UPGRADE = b"HTTP/1.1 101 Switching Protocols\r\n"
 OTHER_KEY = UPGRADE + b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: 0\r\n\r\n"
 NUMBERS = frame("42[1]") + frame('42["steer",{"steering_angle":0,"throttle":1}]')
 DEEP = ("40", "42" + "[" * 60_000, '42["steer",' * 5_000)
-# In the first seven the websocket is not accepted, in the next three there is no session.
+# In the first eight the websocket is not accepted, in the next three there is no session.
 CASES = {
     "closes at once": Case(CLOSED, False),
     "never answers": Case("does not answer", False, holds=True),
@@ -106,6 +106,7 @@ CASES = {
     "has no such page": Case(
         "404: another program's", False, once=b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
     ),
+    "has no websocket": Case("400: .*engineio", False, once=b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n"),
     "sends no line end": Case(ALIEN, False, once=b"HTTP/1.1 101 ", flood=b"x" * 10000),
     "accepts another key": Case(ALIEN, False, reads=True, once=OTHER_KEY),
     "sends the handshake slowly": Case("does not", False, once=UPGRADE * 100, pause=0.05),

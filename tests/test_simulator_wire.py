@@ -13,7 +13,7 @@ import pytest
 from steer_server import LAPS, STEER, Blank, Server, ahead, drive, lake, unused_port
 
 from cloning.base import program
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, printable
 from cloning.recordings.images import decode
 from cloning.wire.client import Answer, parse_answer
 from cloning.wire.protocol import FRAGMENT
@@ -223,7 +223,34 @@ def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
             server.kill()
 
 
+def test_a_server_that_bears_no_ping_of_a_client_is_asked_to_connect():
+    """Socket.IO 3 and 4 in JavaScript; the real simulator could not drive with it."""
+
+    class JavaScript(Server):
+        def send(self, client, text):
+            if text == "3":
+                raise ConnectionError
+            if text != "40":
+                super().send(client, text)
+
+    with JavaScript(ahead, greet=False) as server:
+        assert drive(server).reconnections == 0
+    assert server.messages[0] == "40"
+
+
+@pytest.mark.parametrize("steering", ["0,1", "[0.1]", "nan", "\x1b[2J"])
+def test_an_answer_that_cannot_be_used_is_shown_while_the_next_is_waited_for(steering, capsys):
+    def reply(packet, n):
+        return ['42["other",{}]', STEER % (steering, "1.0"), *ahead(packet, n)]
+
+    with Server(reply) as server:
+        drive(server)
+    told = capsys.readouterr().err
+    assert told.count("cannot be used") == 1
+    assert f'"steering_angle":"{printable(steering)}"' in told and 'texts, such as "0.1"' in told
+
+
 def test_a_server_that_is_silent_is_told_from_a_missing_one():
-    silent = "a server is there, but is silent"
+    silent = "a server is there, but is silent.*its output"
     with Server(lambda packet, n: []) as server, pytest.raises(SimulatorError, match=silent):
         drive(server, wait=1.5)

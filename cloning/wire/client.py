@@ -36,6 +36,12 @@ CLOSE_TIMEOUT = 1.0  # s for a server to notice that the session is over
 READ_BYTES = 4096  # at a time: enough for 40 answers, and few enough to decode before the next picture is due
 MAX_WAITING = 100  # packets that are kept while a first message is waited for
 MAX_PACKET = 1 << 16  # characters; an answer has about 80
+REFUSALS = {  # what they mean, by HTTP status
+    400: ": no WebSocket, or no EIO=4, which python-socketio 4 has with python-engineio 3.13.2, not with 3.14",
+    401: ": its handler of `connect` refuses or fails; see its output",
+    404: ": another program's server has the port",
+}
+USABLE = '"steering_angle" and "throttle", as texts, such as "0.1"'  # what a command must have
 
 
 class ConnectionLost(Exception):
@@ -200,26 +206,27 @@ class Connection:
             raise ConnectionLost(reason) from error
 
     def _open_session(self, address: str, until: float) -> None:
-        """Wait for the server's open packet, ping at once, as the real client does, and ask a silent server."""
+        """Wait for the server's open packet and greeting, and ping, as the real client does; ask a silent server."""
         while not self.packets:
             if time.monotonic() > until:
                 opened = self.protocol.state is ConnectionState.OPEN
                 silent = "accepts connections but does not answer"
-                raise ConnectionLost(f"{address} {'does not speak Engine.IO (it sent nothing)' if opened else silent}")
+                mute = "does not speak Engine.IO (it sent nothing, as servers for the term-2 simulator do)"
+                raise ConnectionLost(f"{address} {mute if opened else silent}")
             self._read_socket(max(0.0, until - time.monotonic()))
         packet = self.packets.popleft()
         if not packet.startswith(OPEN):
             raise ConnectionLost(f"{address} does not speak Engine.IO (it sent {packet[:60]!r})")
-        self._send(PING)
-        self.last_ping = self.pong_due_since = time.monotonic()
         until = min(until, time.monotonic() + GREETING_TIMEOUT)
         while not any(packet.startswith(MESSAGE) for packet in self.packets):
             if (left := until - time.monotonic()) <= 0 or len(self.packets) >= MAX_WAITING:
-                # A server with python-socketio 5 waits for CONNECT, and sends the pings.
+                # A server of Socket.IO 3 or later waits for CONNECT, sends the pings, and may bear none of a client.
                 self._send(CONNECT)
-                self.asked, self.last_ping, self.pong_due_since = True, math.inf, None
-                break
+                self.asked, self.last_ping = True, math.inf
+                return
             self._read_socket(left)
+        self._send(PING)
+        self.last_ping = self.pong_due_since = time.monotonic()
 
     def _read_socket(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for bytes, and decode them."""
@@ -234,8 +241,9 @@ class Connection:
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, RejectConnection):
-            other = ": another program's server has the port" if event.status_code == 404 else ""
-            raise ConnectionLost(f"the server refuses the connection (HTTP {event.status_code}{other})")
+            raise ConnectionLost(
+                f"the server refuses the connection (HTTP {event.status_code}{REFUSALS.get(event.status_code, '')})"
+            )
         elif isinstance(event, CloseConnection):
             if self.protocol.state is ConnectionState.OPEN:  # not a closing frame, but bytes that are no frame at all
                 raise ConnectionLost(f"the server does not speak WebSocket ({event.reason!s:.100})")

@@ -4,15 +4,17 @@ import sys
 import time
 
 from cloning.base import program
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, printable
 from cloning.base.progress import Bar
 from cloning.wire.client import (
     CONNECT,
     CONNECT_TIMEOUT,
+    EVENT,
     GREETING_TIMEOUT,
     MAX_PACKET,
     MESSAGE,
     SEND_TIMEOUT,
+    USABLE,
     Answer,
     Connection,
     ConnectionLost,
@@ -46,6 +48,7 @@ class ClientSession:
         self._waiting_until: float | None = None  # time.monotonic() at which patience ends; None: not waiting
         self._lost: ConnectionLost | None = None  # why the last connection broke, while waiting
         self._told = False  # whether the user knows that the server is not one for the real simulator
+        self._shown = False  # whether the user has seen a command that cannot be used
 
     @property
     def connected(self) -> bool:
@@ -106,10 +109,13 @@ class ClientSession:
         self._waiting_until = self._lost = None
 
     def parse(self, packet: str) -> Answer | None:
-        """Return the answer in a packet, or None; count messages that hold none."""
+        """Return the answer in a packet, or None; count messages that hold none, and show the first such command."""
         answer = parse_answer(packet)
         if answer is None and packet.startswith(MESSAGE) and not packet.startswith(CONNECT):
             self.unusable += 1
+            if not self._shown and packet.startswith(f'{EVENT}["steer"'):
+                self._shown = True
+                _print(f"an answer cannot be used: {printable(packet[len(EVENT) :][:100])}; it must have {USABLE}")
         return answer
 
     def receive_greeting(self) -> None:
@@ -161,9 +167,10 @@ class ClientSession:
         reason = f"{self._lost}; " if self._lost else ""
         remedy = self._remedy_for(self._lost)
         if self._connection:
-            remedy = "; a server is there, but is silent: it may be busy, or have no handler for the event `telemetry`"
+            remedy = "; a server is there, but is silent: it is busy, or its handler of `telemetry` fails or is missing"
+            remedy += ": see its output"
         if self.unusable:
-            remedy = f"; {self.unusable} unusable answers so far: `steer` must contain strings, as drive.py sends them"
+            remedy = f"; {self.unusable} unusable answers so far: `steer` must have {USABLE}"
         return SimulatorError(f"{reason}no usable answer in {self.wait:g} s{remedy}")
 
     def count_reconnection(self, error: ConnectionLost) -> None:
