@@ -79,13 +79,19 @@ class Dialect(Driven):
 
     def open(self, source: str | PointRoad, direction: str | None = None) -> None:
         """Build a track, and set the car at its start. Raises TrackError."""
-        self.track, self.disturbance = Track(source, direction), self.stage.disturbance or FALLING.get(self.weather)
-        for i, built in enumerate(self.build(source)):
+        self.track = Track(source, direction)
+        self.show()
+        self.restart()
+
+    def show(self) -> None:
+        """Let the telemetry's images show the track in its weather from now on. Raises TrackError."""
+        self.disturbance, self.seen = self.stage.disturbance or FALLING.get(self.weather), -1.0
+        for i, built in enumerate(self.build(self.track.source)):
             if i < len(self.views):
                 self.views[i].move(Scene(built))
             else:
                 self.views.append(Cameras(Scene(built), ("center",)))
-        self.restart()
+        self.views[0].disturb(self.disturbance)
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
         """Return what the telemetry's images show. Raises TrackError for an unknown weather."""
@@ -197,7 +203,7 @@ class Measures(Dialect):
 class Roads(Dialect):
     """Roads sent as text; the car stays where it leaves them until the program sets it back. Speed is in m/s.
 
-    A weather is that of the roads sent after it. Its intensity is not used.
+    A weather is seen at once, and on the roads sent after it. Its intensity is not used.
     These programs answer at once, with what their driver, in another thread, has commanded last.
     """
 
@@ -211,9 +217,13 @@ class Roads(Dialect):
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
-        if event == "weather" and isinstance(data, dict):
-            self.weather = ROAD_WEATHERS.get(str(data.get("type")), "sunny")
         self.same, self._last = event == "steer" and data == self._last, data
+        if event == "weather" and isinstance(data, dict):
+            weather = ROAD_WEATHERS.get(str(data.get("type")), "sunny")
+            if weather != self.weather:
+                self.weather = weather
+                self.show()
+            return True
         if event == "steer":
             self.still = self.run.at_end
             return self.obey(data)

@@ -147,18 +147,22 @@ def test_roads_are_laid_driven_to_their_end_and_set_back():
     assert 5 < max(number(data, "speed") for data in program.data) <= 13.5  # m/s: 30 mph
 
 
-def test_each_road_has_the_weather_sent_before_it():
-    """perturbation-drive sends the weather and then the road once more."""
-    dialect, images = Roads(LAKE), []
+def test_a_weather_is_seen_at_once_and_on_the_roads_sent_after_it(monkeypatch):
+    """perturbation-drive sends it after the road, as the whole answer to a telemetry."""
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 30.0)
+    plan = [["track", {"track_string": ROADS[0]}], steer(0, 1)]
     for weather in ("Sun", "Fog", "Rain", "MoonShine Skybox"):
-        assert not dialect.handle("weather", {"type": weather, "rate": "30"}), "the road is the answer"
-        dialect.restart()  # on the road before, in its weather
-        assert bool(dialect.views[0].disturbance) == (weather == "MoonShine Skybox")
-        assert dialect.handle("track", {"track_string": ROADS[0]})
-        images.append(decode(base64.b64decode(json.loads(dialect.telemetry()[2:])[1]["image"])).astype(int))
-    sun, fog, rain, moon = images
-    assert min(np.abs(sun - fog).mean(), np.abs(sun - rain).mean(), np.abs(fog - rain).mean()) > 5
-    assert (sun == moon).all()
+        plan += [["weather", {"type": weather, "rate": "30"}], ["track", {"track_string": ROADS[0]}], steer(0, 1)]
+    with Program(lambda data, n: [plan[n]] if n < len(plan) else None) as program:
+        begin = time.monotonic()
+        assert join("roads", program) == 0
+    assert time.monotonic() - begin < 20
+    images = [decode(base64.b64decode(data["image"])).astype(int) for data in program.data]
+    for sun, fog, rain, moon in (images[3::3], images[4::3]):  # on the road that lies there, and on the next
+        assert min(np.abs(sun - fog).mean(), np.abs(sun - rain).mean(), np.abs(fog - rain).mean()) > 5
+        assert (sun == moon).all()
+    places = [number(data, "pos_z") for data in program.data]
+    assert min(places[3::3]) > max(places[4::3]), "the car stays where it is"
 
 
 def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_however_slow_it_is(monkeypatch):
