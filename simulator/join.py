@@ -248,8 +248,9 @@ def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> in
 
     track: the first; own: options of a road of one's own, for sent roads, too. Raises UserError, OSError.
     """
-    with open(arguments.log or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
-        if arguments.log:
+    name = None if arguments.log == "-" else arguments.log  # as Unity takes it: the terminal
+    with open(name or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
+        if name:
             stack.enter_context(contextlib.redirect_stdout(log))
             stack.enter_context(contextlib.redirect_stderr(log))
         stage = Stage(track.source, arguments.direction, arguments.look, own, arguments.disturb)

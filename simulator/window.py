@@ -266,9 +266,9 @@ class Window(ShowBase):
             case "save":
                 self.saved = (run.s, run.offset)
             case "jump":
-                begin = run.s - run.travelled  # of the laps
+                # Never forward: else a lap could end that was not driven.
+                run.travelled -= (run.s - self.saved[0]) % run.track.length
                 run.s, run.at_end = self.saved[0], False
-                run.travelled = run.laps * run.track.length + (run.s - begin) % run.track.length
                 run.set_back(self.saved[1])
             case "view":
                 self.chase = not self.chase

@@ -363,6 +363,12 @@ def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     assert "1 episode, " in (tmp_path / "unitylog.txt").read_text()
 
 
+def test_a_log_that_is_named_as_a_dash_is_the_terminal_as_for_unity(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["join", "--dialect", "measures", "--port", "9", "--wait", "0.1", "-logFile", "-"]) == 2
+    assert "waited 0.1 s" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
 @SCRIPTS
 def test_a_launcher_replaces_none_but_an_earlier_one(tmp_path, capsys):
     launcher = tmp_path / "udacity.x86_64"

@@ -337,6 +337,14 @@ def test_what_exists_is_not_replaced(recordings, written, tub):
         assert "tub: exists already; name another folder" in refused(source, "--output", tub)
 
 
+def test_options_without_an_effect_are_refused(recordings, tub, tmp_path):
+    assert refused(tub, "--steering", "angle", "--output", tmp_path / "x").endswith(
+        "--steering is of a data set, not of a tub; leave it out"
+    )
+    told = refused(recordings[0], "--full-lock", 0.5, "--output", tmp_path / "x")
+    assert "--full-lock is of a data set or tub, not of a recording" in told and not (tmp_path / "x").exists()
+
+
 def test_the_environment_for_lerobot(written):
     """Its evaluation steps such environments with actions in float32, and expects these keys."""
     [(track, environments)] = runpy.run_path(str(written / "env.py"))["make_env"](n_envs=1).items()

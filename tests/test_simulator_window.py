@@ -301,16 +301,16 @@ def test_an_error_ends_the_window_without_panda3ds_traceback():
     assert window.failed is error and stopped == [True]
 
 
-def test_a_jump_back_does_not_count_as_driven():
-    """Nor does one to a place before the lap's start count as a lap."""
-    window: Any = SimpleNamespace(simulation=Run(Track("lake")), saved=(5.0, 0.0))
-    run, length = window.simulation, window.simulation.track.length
-    run.s = run.travelled = 0.95 * length
+@pytest.mark.parametrize(("share", "saved"), [(0.95, 5), (0.01, -2), (0.2, 500)])
+def test_a_jump_does_not_count_as_driven(share, saved):
+    """Neither one to a place before the lap's start nor one ahead brings the car nearer to the lap's end."""
+    run = Run(Track("lake"))
+    window: Any = SimpleNamespace(simulation=run, saved=(saved % run.track.length, 0.0))
+    run.s = run.travelled = share * run.track.length
     Window.act(window, "jump")
-    assert (run.laps, run.s, run.travelled) == (0, 5, 5)
-    window.saved = (0.5 * length, 0.0)
-    Window.act(window, "jump")
-    assert run.travelled == pytest.approx(0.5 * length)
+    ahead = saved > share * run.track.length
+    assert run.laps == 0 and run.s == saved % run.track.length
+    assert run.travelled == pytest.approx(saved - ahead * run.track.length)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")

@@ -27,6 +27,8 @@ from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import find_folders, print_findings, read_recording
 from cloning.recordings.saved_frames import DRIVEN
 
+OPTIONS = {"camera": ("data set", "tub"), "steering": ("data set",), "full_lock": ("data set", "tub")}  # of what
+
 
 def parse_arguments() -> argparse.Namespace:
     """Return the arguments of the command line."""
@@ -38,9 +40,9 @@ def parse_arguments() -> argparse.Namespace:
     add("--camera", metavar="NAME", help="of a data set or tub: the camera that looks ahead")
     add("--steering", metavar="NAME", help="of a data set: the number that is the steering")
     lock = "of a data set or tub: its steering at 25 degrees to the right (default 1)"
-    add("--full-lock", type=number(float), default=1.0, metavar="VALUE", help=lock)
+    add("--full-lock", type=number(float), metavar="VALUE", help=lock)
     arguments = parser.parse_args()
-    if not arguments.full_lock:
+    if arguments.full_lock == 0:
         parser.error("argument --full-lock: 0 is straight ahead")
     return arguments
 
@@ -58,8 +60,12 @@ def main() -> int:
     if output.exists():
         raise OutputError(f"{output}: exists already; name another folder, or delete this one")
     is_drive = (source / DRIVEN).is_file()
-    if (is_tub or is_data_set or is_drive) and len(arguments.source) > 1:
-        raise UserError(f"{source} is a {'tub' if is_tub else 'drive' if is_drive else 'data set'}: name it alone")
+    kind = "tub" if is_tub else "drive" if is_drive else "data set" if is_data_set else "recording"
+    if kind != "recording" and len(arguments.source) > 1:
+        raise UserError(f"{source} is a {kind}: name it alone")
+    for option, kinds in OPTIONS.items():
+        if getattr(arguments, option) is not None and kind not in kinds:
+            raise UserError(f"--{option.replace('_', '-')} is of a {' or '.join(kinds)}, not of a {kind}; leave it out")
     if is_drive:
         samples = read_driven(source, notes)
     elif is_tub:
@@ -81,7 +87,7 @@ def main() -> int:
             return program.DONE
         samples = read_data_set(source, arguments.camera, arguments.steering)
     try:
-        rows = write_recording(samples, output, arguments.full_lock, notes)
+        rows = write_recording(samples, output, arguments.full_lock or 1.0, notes)
     except RecordingError as error:
         raise RecordingError(f"{source}: {error}") from None
     finally:  # also why there is no usable row

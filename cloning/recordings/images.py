@@ -87,13 +87,13 @@ def decode(jpeg: bytes) -> np.ndarray:
     rows, columns = jpeg_size(jpeg)
     if (rows, columns) != FRAME[:2]:
         raise ValueError(f"{columns}x{rows} pixels where {FRAME[1]}x{FRAME[0]} are expected")
-    frame = _pixels(jpeg)
+    frame = pixels(jpeg)
     if frame.shape != FRAME or frame.dtype != np.uint8:
         raise ValueError("damaged")
     return frame
 
 
-def _pixels(jpeg: bytes) -> np.ndarray:
+def pixels(jpeg: bytes) -> np.ndarray:
     """Return the pixels of a JPEG of any size: uint8 (rows, columns, 3), RGB. Raises ValueError if it is damaged."""
     try:
         pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -125,7 +125,7 @@ def compress(around: np.ndarray, rows: slice, quality: int) -> np.ndarray:
     around: the frame's `compressed_rows(rows)`, uint8 (m, 320, 3), RGB; quality: 0..100. Returns uint8 (k, 320, 3).
     """
     first = compressed_rows(rows).start
-    return _pixels(encode(around, quality))[rows.start - first : rows.stop - first]
+    return pixels(encode(around, quality))[rows.start - first : rows.stop - first]
 
 
 def read_jpeg(path: Path) -> bytes:

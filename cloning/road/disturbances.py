@@ -18,6 +18,8 @@ import cv2
 import numpy as np
 from numpy.random import Generator, default_rng
 
+from cloning.recordings.images import encode, pixels
+
 STRENGTHS = (1, 2, 3, 4, 5)
 
 
@@ -198,8 +200,7 @@ def colour(image: np.ndarray, turn: float, seed: int, frame: Generator) -> np.nd
 
 def jpeg(image: np.ndarray, quality: float, seed: int, frame: Generator) -> np.ndarray:
     """Encode and decode."""
-    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, round(quality)])[1]
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR))
+    return pixels(encode(image, round(quality)))
 
 
 def pixelated(image: np.ndarray, scale: float, seed: int, frame: Generator) -> np.ndarray:
