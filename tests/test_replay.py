@@ -263,7 +263,7 @@ def test_in_process_the_network_sees_exactly_what_a_server_receives(recording, t
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, parallel):
-    """Each in a process of its own, but for the last one, if they can be."""
+    """Until they part they are one; then those but the last go on in processes of their own, if they can."""
 
     def weaving(frame) -> float:
         return float(np.clip(frame.human_steering + 0.03 * (frame.row > 100), -1, 1))
@@ -280,6 +280,17 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
     assert watched == [2.5] * len(recording)
     assert (tmp_path / str(os.getpid())).exists()
     assert len(list(tmp_path.iterdir())) == (3 if parallel and CAN_FORK else 1)
+
+
+def test_drives_that_never_part_are_driven_once(recording):
+    lines, rows = human(recording), list[int]()
+
+    def driver(frame):
+        rows.append(frame.row)
+        return 0.99 * frame.human_steering
+
+    done = command.drive_at_limits(recording, lines, driver, (1.0, 2.5))
+    assert rows == [*range(300)] and done == [replay.drive(recording, lines, limit, driver) for limit in (1.0, 2.5)]
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ import video
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
 from cloning.replay import command
+from cloning.replay.replay import Drive
 
 FIRST, SECOND = "2018_07_16_17_11_42_000.jpg", "2018_07_16_17_11_42_001.jpg"  # before those of `save`
 
@@ -156,7 +157,7 @@ def test_ctrl_c_in_the_first_frame_leaves_no_film(tmp_path, monkeypatch):
 @pytest.mark.skipif(not command.CAN_FORK, reason="on this system drives follow one another")
 def test_drives_in_processes_do_not_wait_for_the_threads_of_an_old_film(tmp_path):
     """A fork copies none of them: where a film was garbage by then, its collection in a process never ended."""
-    collect: list[Any] = [gc.collect]
+    line: Any = SimpleNamespace(go_on=lambda _: gc.collect())
     gc.disable()
     try:
         with FilmWriter(tmp_path / "old.mp4", 15) as writer:
@@ -164,9 +165,10 @@ def test_drives_in_processes_do_not_wait_for_the_threads_of_an_old_film(tmp_path
         old: list[object] = [writer]
         old.append(old)
         del writer, old
-        with command.ForkedDrives(collect) as forked:
+        with command.ForkedDrives({}) as forked:
+            forked.start(line, [Drive(1.0)])
             forked.collect(20)
-        assert forked.results
+        assert forked.drives
     finally:
         gc.enable()
 

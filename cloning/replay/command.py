@@ -22,11 +22,11 @@ from cloning.recordings.log import Recording, find_folders
 from cloning.replay.replay import (
     Drive,
     Driver,
+    LineDrive,
     NothingToReplay,
     ReferenceLine,
     ReplayFrame,
     Watcher,
-    drive,
     load_recording,
     reference_lines,
 )
@@ -102,66 +102,64 @@ def drive_at_limits(
     parallel: bool = False,
     disturbance: Disturbance | None = None,
 ) -> list[Drive]:
-    """Return the drives of a recording at each limit, in this order.
+    """Return the drives of a recording at each limit, in this order; see `LineDrive`.
 
-    watch: of the drive at the last limit, called after each row, or None. parallel: on Linux, drive at all limits at
-    the same time, each in a process of its own but the last, which is driven in this one; the driver must not learn
-    from one drive anything that it needs in another. disturbance: see `drive`. If one drive fails, or on Ctrl-C, the
-    others are ended. Raises what a drive raises, and SimulatorError if its process was killed.
+    watch: of the drive at the last limit, called after each row, or None. parallel: on Linux, those that part from the
+    last one go on in processes of their own; else they are driven anew along the line, one after the other. The driver
+    must not learn from one drive anything that it needs in another. disturbance: see `drive`. If one drive fails, or on
+    Ctrl-C, the others are ended. Raises what a drive raises, and SimulatorError if its process was killed.
     """
-    rows = sum(len(line.stretch) for line in lines)
+    if parallel := parallel and CAN_FORK:
+        cv2.setNumThreads(1)  # its threads do not survive a fork, and the other drives need the cores
+    drives = {limit: Drive(limit) for limit in limits}
 
-    def drive_at(index: int, watch: Watcher | None = None) -> Drive:
-        name = f"{recording.folder.name}, limit {limits[index]:g} m"
-        with progress_bar(rows, "row", desc=name, leave=False, position=index) as bar:
+    def drive_along(number: int, line: ReferenceLine) -> None:
+        begin = functools.partial(LineDrive, recording, line, driver, disturbance, number)
+        here, anew, rows = begin(), list[Drive](), len(drives[limits[-1]].row)
+        with ForkedDrives(drives) as forked:
 
             def after_row(frame: ReplayFrame, done: Drive) -> None:
                 bar.update()
+                forked.collect(0)
                 if watch:
                     watch(frame, done)
 
-            return drive(recording, lines, limits[index], driver, after_row, disturbance)
+            part = functools.partial(forked.start, here) if parallel else anew.extend
+            here.go_on([*drives.values()], after_row, part)
+            for done in anew:
+                done.cut(rows)
+                begin().go_on([done], lambda *_: bar.update())
+            forked.collect(None)
 
-    *others, last = range(len(limits))
-    if not (parallel and CAN_FORK):
-        return [*map(drive_at, others), drive_at(last, watch)]
-    cv2.setNumThreads(1)  # its threads do not survive a fork, and the other drives need the cores
-    with ForkedDrives([functools.partial(drive_at, index) for index in others]) as forked:
-
-        def watch_all(frame: ReplayFrame, done: Drive) -> None:
-            forked.collect(0)
-            if watch:
-                watch(frame, done)
-
-        driven_here = drive_at(last, watch_all)
-        forked.collect(None)
-        return [*(forked.results[index] for index in others), driven_here]
+    with progress_bar(sum(len(line.stretch) for line in lines), "row", desc=recording.folder.name, leave=False) as bar:
+        for number, line in enumerate(lines):
+            drive_along(number, line)
+    return [drives[limit] for limit in limits]
 
 
 class ForkedDrives:
-    """Drives in forked processes, one each: in threads, they would wait for one another's Python code.
+    """Drives that go on in forked processes, one each: in threads, they would wait for one another's Python code.
 
     It is a context, at whose end none of them runs any more.
     """
 
-    def __init__(self, drives: Sequence[Callable[[], Drive]]):
-        """Start them; what they change in memory is lost, but for the Drive that each returns."""
-        context = multiprocessing.get_context("fork")
+    def __init__(self, drives: dict[float, Drive]):
+        """drives: by their limits; each that was started is replaced when it has ended."""
+        self.drives = drives
         self.processes: list[BaseProcess] = []
-        self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its index
-        self.results: dict[int, Drive] = {}
-        try:
+        self.pending: list[Connection] = []  # where results will come from
+
+    def start(self, line: LineDrive, drives: Sequence[Drive]) -> None:
+        """Let drives go on to the end of a line; what that changes in memory is lost, but for the Drives themselves."""
+        context = multiprocessing.get_context("fork")
+        for done in drives:
+            receiver, sender = context.Pipe(duplex=False)
             with starting():
-                for index, drive in enumerate(drives):
-                    receiver, sender = context.Pipe(duplex=False)
-                    process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
-                    process.start()
-                    sender.close()
-                    self.processes.append(process)
-                    self.pending[receiver] = index
-        except KeyboardInterrupt:
-            self.__exit__()
-            raise
+                process = context.Process(target=_go_on, args=(line, done, sender), daemon=True)
+                process.start()
+                self.processes.append(process)
+            sender.close()
+            self.pending.append(receiver)
 
     def __enter__(self) -> Self:
         return self
@@ -186,13 +184,15 @@ class ForkedDrives:
                     raise SimulatorError("the process of a drive was killed, or failed with the error above") from None
                 if isinstance(result, UserError):
                     raise result
-                self.results[self.pending.pop(receiver)] = result
+                self.drives[result.limit] = result
+                self.pending.remove(receiver)
 
 
-def _send_result(drive: Callable[[], Drive], sender: Connection) -> None:
-    """Send what a drive returns, or the UserError that it raises."""
+def _go_on(line: LineDrive, done: Drive, sender: Connection) -> None:
+    """Drive to the line's end, and send the Drive, or the UserError that ends it."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
-        sender.send(drive())
+        line.go_on([done])
+        sender.send(done)
     except UserError as error:
         sender.send(error)

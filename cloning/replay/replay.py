@@ -6,7 +6,7 @@ than a limit, it is set back onto the line and an intervention is counted.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -81,6 +81,12 @@ class Drive:
     def autonomy(self) -> float:
         """Return NVIDIA's measure; see `autonomy.autonomy`."""
         return autonomy(len(self.interventions), sum(self.seconds))
+
+    def cut(self, rows: int) -> None:
+        """Forget all but the first rows."""
+        for column in (self.row, self.seconds, self.offset, self.offset_from_human, self.steering, self.human_steering):
+            del column[rows:]
+        self.interventions = {at: offset for at, offset in self.interventions.items() if at < rows}
 
 
 def load_recording(folder: str | Path) -> CheckedRecording:
@@ -239,7 +245,62 @@ class ReplayFrame:
 
 
 Driver = Callable[[ReplayFrame], float]  # returns steering, -1..1
-Watcher = Callable[[ReplayFrame, Drive], None]
+Watcher = Callable[[ReplayFrame, Drive], object]
+Parting = Callable[[list[Drive]], None]
+
+
+class LineDrive:
+    """A driver's car on its way along one reference line: drives at several limits are one until they part.
+
+    They part where the car is beyond some of their limits, but not beyond all.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        line: ReferenceLine,
+        driver: Driver,
+        disturbance: Disturbance | None = None,
+        seed: int = 0,
+    ):
+        """Begin at the line's first row; disturbance, seed: of the warped frames."""
+        self.recording, self.driver = recording, driver
+        self.car, self.views = ReplayedCar(recording, line), StretchViews(recording, line.stretch)
+        self.disturber = Disturber(disturbance, seed) if disturbance else None
+        self.at = 0  # the row of the line at which the car is
+
+    def go_on(self, drives: Sequence[Drive], watch: Watcher | None = None, part: Parting | None = None) -> None:
+        """Drive to the line's end, and add the rows to all drives.
+
+        watch: called with the last drive after each row, or None; part: called where the last drive and others part,
+        before the row, with these, to which no more is added.
+        """
+        car = self.car
+        for at in range(self.at, len(car)):
+            self.at = at
+            offset = car.offset(at)
+            beyond = [abs(offset) > done.limit for done in drives]
+            if part and beyond.count(beyond[-1]) < len(drives):
+                part([done for done, is_beyond in zip(drives, beyond, strict=True) if is_beyond != beyond[-1]])
+                drives = [done for done, is_beyond in zip(drives, beyond, strict=True) if is_beyond == beyond[-1]]
+            if beyond[-1]:
+                if at:
+                    for done in drives:
+                        done.interventions[len(done.row)] = offset
+                car.set_back(at)
+            frame = ReplayFrame(self.recording, self.views, car, at, self.disturber)
+            steering = float(np.float32(self.driver(frame)))  # float32 as in the network, whatever the wire's digits
+            for done in drives:
+                done.row.append(frame.row)
+                done.seconds.append(float(car.seconds[at - 1]) if at else 0.0)
+                done.offset.append(car.offset(at))
+                done.offset_from_human.append(car.offset_from_human())
+                done.steering.append(steering)
+                done.human_steering.append(frame.human_steering)
+            if watch:
+                watch(frame, drives[-1])
+            if at + 1 < len(car):
+                car.move(at, steering)
 
 
 def drive(
@@ -256,23 +317,5 @@ def drive(
     """
     done = Drive(limit)
     for number, line in enumerate(lines):
-        car, views = ReplayedCar(recording, line), StretchViews(recording, line.stretch)
-        disturber = Disturber(disturbance, number) if disturbance else None
-        for at in range(len(car)):
-            if abs(offset := car.offset(at)) > limit:
-                if at:
-                    done.interventions[len(done.row)] = offset
-                car.set_back(at)
-            frame = ReplayFrame(recording, views, car, at, disturber)
-            steering = float(np.float32(driver(frame)))  # float32 as in the network, whatever the wire's digits
-            done.row.append(frame.row)
-            done.seconds.append(float(car.seconds[at - 1]) if at else 0.0)
-            done.offset.append(car.offset(at))
-            done.offset_from_human.append(car.offset_from_human())
-            done.steering.append(steering)
-            done.human_steering.append(frame.human_steering)
-            if watch:
-                watch(frame, done)
-            if at + 1 < len(car):
-                car.move(at, steering)
+        LineDrive(recording, line, driver, disturbance, number).go_on([done], watch)
     return done
