@@ -11,6 +11,7 @@ import real_recordings
 import torch
 from commands import call_here
 from rendered import render_frame
+from scenes import Here
 
 import drive as drive_py
 import video
@@ -227,6 +228,7 @@ def test_real_cameras_are_mounted_as_ever_and_turned_ones_are_found(folder: Path
 
 def test_the_training_writes_weights_and_measures_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_mount, "started_workers", Here)
     options = ["--looks", "0", "--roads", "1", "--drives", "1", "--epochs", "2"]
     assert train_mount.main(options) == 0
     printed = capsys.readouterr().out
