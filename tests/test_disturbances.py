@@ -17,6 +17,8 @@ from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
 from cloning.recordings.writer import RecordingWriter
 from cloning.replay import replay
+from cloning.replay.model_driver import ModelDriver
+from cloning.road.autonomy import LIMITS
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber, disturb
 from cloning.road.track import Track
 from cloning.training import light
@@ -256,6 +258,11 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(sample_recording
     conditions = driving.Conditions(str(SHIPPED_MODEL), 30, 0, "cw", 0.01 * Track("lake").length, seed=1)
     alone = driving.drive(conditions._replace(set_back=True, disturbance=Disturbance("late", 5)), "lake")
     assert found[late] == {"autonomy": 100, "departures": 0, "distance": round(alone.mean, 3)}
+    replayed = found[of(f"{sample_recording}, late:5")]
+    recording, driver = replay.load_recording(sample_recording), ModelDriver(str(SHIPPED_MODEL))
+    lines = replay.reference_lines(recording)
+    done = replay.drive(recording, lines, LIMITS[-1], driver, disturbance=Disturbance("late", 5))
+    assert replayed["distance"] == pytest.approx(np.abs(done.offset).mean(), abs=1e-3), "corrected as in drives"
     for course in (" lake cw, 30 mph, look 0, 0.01 laps", f"{sample_recording}"):
         assert found[of(f"{course}, clear")]["distance"] != found[of(f"{course}, late:5")]["distance"]
     assert (tmp_path / "found" / "robustness.png").read_bytes().startswith(b"\x89PNG")

@@ -8,6 +8,7 @@ from cloning.base.errors import RecordingError, SimulatorError
 from cloning.base.frame import FRAME
 from cloning.network.compute import one_thread
 from cloning.recordings.format import DRIVING_LOG
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Driver, ReplayFrame, drive, load_recording, reference_lines
 from cloning.replay.server_driver import ServerDriver
 from cloning.road.autonomy import LIMITS
@@ -47,13 +48,19 @@ def replay(driver: str, folder: Path) -> Driven:
 
 
 def driver_of(driver: str) -> Driver:
-    """Return a driver, as in `Conditions`, of replays; the expert is the recovery steering. Raises UserError."""
+    """Return a driver, as in `Conditions`, of replays; the expert is the recovery steering. Raises UserError.
+
+    A model's steering is corrected as in drives.
+    """
     if driver == "straight":
         return lambda frame: 0.0
     if driver == "expert":
         return ReplayFrame.recovery_steering
     if address := server_address(driver):
         return ServerDriver(*address, WAIT)
+    if not driver.endswith(".onnx"):
+        one_thread()
+        return ModelDriver(driver)
     steering, rows = load_driver(driver), slice(0, FRAME[0])
 
     def steer(frame: ReplayFrame) -> float:
