@@ -18,7 +18,7 @@ from drive_process import awaited
 from cloning.base import program
 from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.base.outputs import short_names
-from cloning.browse import analyse, analyses, library, summary
+from cloning.browse import analyse, analyses, computed, library, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.filter import matching
 from cloning.browse.library import Library, UnknownError
@@ -373,7 +373,7 @@ def test_threads_that_want_the_same_recording_read_it_once(recording, monkeypatc
         time.sleep(0.2)
         return read_uncut(folder)
 
-    monkeypatch.setattr(library, "read_uncut", slowly)
+    monkeypatch.setattr(computed, "read_uncut", slowly)
     with ThreadPoolExecutor() as pool:
         one, two = pool.map(lambda _: recording.read(), range(2))
     assert one is two and read == [recording.folder]

@@ -19,7 +19,7 @@ from drive_process import awaited
 from test_excluded import center
 
 from cloning.base.errors import ModelError, UserError
-from cloning.browse import analyse, analyses, attend, library, runs
+from cloning.browse import analyse, analyses, attend, computed, library, runs
 from cloning.browse.analyses import Analysis, UnknownError, stamp, write_result
 from cloning.browse.attention import Attention
 from cloning.network.attention import visual_backprop
@@ -114,7 +114,7 @@ def test_a_replay_is_there_no_more_once_one_of_other_cuts_has_taken_its_place(li
         replayed(linked, model, 1.0, np.zeros(50), [])
         assert recording.details("1")["replays"][0]["state"] == "ready"
         recording.restore(cuts)
-        library._result.cache_clear()  # as if other recordings had been looked at
+        computed.result.cache_clear()  # as if other recordings had been looked at
         assert recording.details("1")["replays"][0]["state"] == "none"
 
 
@@ -134,8 +134,8 @@ def test_what_a_page_asks_for_again_and_again_is_computed_once(linked, tmp_path,
 
         first = asked()
         assert [cut["stretches"] for cut in first[-1]["cuts"]] == [[[3, 6]]] and first[2]["models"][0]["error"]
-        monkeypatch.setattr(library, "read_uncut", None)
-        monkeypatch.setattr(library, "cut_rows", None)
+        monkeypatch.setattr(computed, "read_uncut", None)
+        monkeypatch.setattr(computed, "cut_rows", None)
         assert asked() == first
 
 

@@ -1,7 +1,6 @@
 """The recordings that the page shows, read again whenever their files change."""
 
 import contextlib
-import functools
 import hashlib
 import os
 import tempfile
@@ -16,24 +15,20 @@ from cloning.base.errors import OutputError, RecordingError, UserError, message_
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.frame import FRAME
 from cloning.base.outputs import short_names
-from cloning.browse import replays, summary
-from cloning.browse.analyses import LANE, Analyses, Analysis, Result, UnknownError, file_stamp, read_result, stamp
+from cloning.browse import computed, replays, summary
+from cloning.browse.analyses import LANE, Analyses, Analysis, Result, UnknownError, file_stamp, stamp
 from cloning.browse.attention import Attention
 from cloning.browse.filter import matching, stretches_of
-from cloning.recordings.excluded import EXCLUDED, TAGS, Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
+from cloning.recordings.excluded import EXCLUDED, TAGS, Cut, add_cuts, delete_cuts, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, SAMPLE_RATE
 from cloning.recordings.images import jpeg_size, read_frame, read_jpeg
-from cloning.recordings.log import Recording, find_folders, read_uncut
+from cloning.recordings.log import Recording, find_folders
 from cloning.recordings.part import write_part
 from cloning.road.autonomy import LIMITS
 from cloning.road.overlay import overlay
 
-OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
 COLUMNS = ("steering", "throttle", "brake", "speed", "seconds")  # of the log; the analyses add to them
 MAX_FILM = 300 * SAMPLE_RATE  # rows: five minutes, which take half a minute to encode
-
-_wanted: dict[Path, threading.Lock] = {}
-_reading = threading.Lock()
 
 
 class Library:
@@ -117,18 +112,18 @@ class ShownRecording:
                 f"{self.folder / DRIVING_LOG}: has changed since this page read it; load the page again. "
                 "Your cuts are in the recording's folder"
             )
-        return _read(self.folder, now)
+        return computed.read(self.folder, now)
 
     def overview(self) -> dict[str, Any]:
         """Return what the list shows of a recording; {"message"} instead of figures if it can't be read."""
         shown: dict[str, Any] = {"id": self.identifier, "name": self.name, "folder": str(self.folder)}
         try:
             cuts, version = tuple(read_cuts(self.folder)), self.version()
-            shown |= {"version": version, **_figures(self.folder, version, cuts)}
+            shown |= {"version": version, **computed.figures(self.folder, version, cuts)}
             shown["tags"] = sorted({tag.reason for tag in read_cuts(self.folder, TAGS)})
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
-                shown |= _road(self.folder, version, cuts, shown["lane"]["stamp"])
+                shown |= computed.road(self.folder, version, cuts, shown["lane"]["stamp"])
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
@@ -150,7 +145,7 @@ class ShownRecording:
         if "message" in shown:  # a file has changed since
             raise RecordingError(shown["message"])
         for kind, file in (("cuts", EXCLUDED), ("tags", TAGS)):
-            shown[kind] = _covered(self.folder, version, tuple(read_cuts(self.folder, file)), file)[1]
+            shown[kind] = computed.covered(self.folder, version, tuple(read_cuts(self.folder, file)), file)[1]
         offset = self.column("offset") if shown["lane"]["state"] == "ready" else None
         steering = [self.column(f"model-{at}") for at, model in enumerate(models) if model["state"] == "ready"]
         return shown | {
@@ -166,7 +161,7 @@ class ShownRecording:
     def _replay(self, version: str, column: str, begin: bool = False) -> dict[str, Any]:
         shown = self._state(column, begin, again=begin)
         if shown["state"] == "ready":
-            shown |= _driven(self.folder, version, self._analysis(column), shown["stamp"])
+            shown |= computed.driven(self.folder, version, self._analysis(column), shown["stamp"])
         return shown
 
     def replay(self, limit: str, begin: bool) -> None:
@@ -195,7 +190,7 @@ class ShownRecording:
     def _result(self, column: str) -> tuple[Result, str]:
         """Return the result of the analysis that has a column, and its stamp."""
         now = stamp(self.folder, self._analysis(column))
-        return _result(self.folder, self._analysis(column), now), now
+        return computed.result(self.folder, self._analysis(column), now), now
 
     def column(self, name: str, version: str | None = None) -> np.ndarray:
         """Return a column: float32 (n,), nan where nothing is known. Raises UnknownError, RecordingError."""
@@ -241,7 +236,7 @@ class ShownRecording:
             steering = self._state(f"model-{at}", begin, again=begin)
             error = None
             if steering["state"] == "ready":
-                error = _error(self.folder, version, cuts, self._analysis(f"model-{at}"), steering["stamp"])
+                error = computed.error(self.folder, version, cuts, self._analysis(f"model-{at}"), steering["stamp"])
             replay = self._replay(version, column, begin)
             models.append({"name": name, "steering": steering, "error": error, "replay": replay})
         return shown | {"models": models}
@@ -263,7 +258,7 @@ class ShownRecording:
             result, now = self._result(picture)
             index = replays.index_of(result, int(recording.images[row, 0]))
             line = int(result.columns["line"][index])
-            return _line_views(self.folder, self.version(), replay, now, line).jpeg(index)
+            return computed.line_views(self.folder, self.version(), replay, now, line).jpeg(index)
         if picture not in CAMERAS:
             raise UnknownError(f"no picture {picture[:40]}")
         path = recording.path(row, CAMERAS.index(picture))
@@ -277,7 +272,7 @@ class ShownRecording:
 
     def _kept(self, version: str) -> np.ndarray:
         """Return the rows that are not cut: bool (n,). Raises RecordingError."""
-        return ~_covered(self.folder, version, tuple(read_cuts(self.folder)))[0]
+        return ~computed.covered(self.folder, version, tuple(read_cuts(self.folder)))[0]
 
     def _with_row(self, row: int, version: str | None) -> Recording:
         recording = self.read(version)
@@ -288,7 +283,7 @@ class ShownRecording:
     def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
         """Cut or tag stretches, and return the cuts that were not there. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
-        _covered(self.folder, self.version(), tuple(cuts), file)  # refuses what is no stretch
+        computed.covered(self.folder, self.version(), tuple(cuts), file)  # refuses what is no stretch
         return add_cuts(self.folder, *cuts, file=file)
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
@@ -335,70 +330,3 @@ class ShownRecording:
                 for row in range(len(selected)):
                     writer.add(overlay(read_frame(selected.path(row)), float(selected.steering[row])))
             return path.read_bytes()
-
-
-def _read(folder: Path, version: str) -> Recording:
-    with _wanted.setdefault(folder, threading.Lock()):  # threads that want the same recording read it once
-        return _read_once(folder, version)
-
-
-@functools.lru_cache(maxsize=OPEN)
-def _read_once(folder: Path, version: str) -> Recording:
-    with _reading:  # one at a time, since each takes memory
-        return read_uncut(folder)
-
-
-@functools.lru_cache(maxsize=2 * OPEN)  # thousands of cuts take a second, and a page asks every few
-def _covered(
-    folder: Path, version: str, cuts: tuple[Cut, ...], file: str = EXCLUDED
-) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """Return which rows are in a cut, or with TAGS in a tag, bool (n,), and each cut with its rows.
-
-    Raises RecordingError.
-    """
-    recording, shown = _read(folder, version), []
-    is_cut = np.zeros(len(recording), bool)
-    covered = cut_rows(folder, cuts, recording.names, recording.images[:, 0], file)
-    for cut, rows in zip(cuts, covered, strict=True):
-        is_cut |= rows
-        shown.append({**cut.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)})
-    return is_cut, shown
-
-
-@functools.lru_cache(maxsize=6 * OPEN)  # 100,000 rows take 3 MB
-def _result(folder: Path, analysis: Analysis, now: str) -> Result:
-    result = read_result(folder, analysis)
-    if result is None:
-        raise UnknownError(f"{folder}: the analysis that tells this column is not done")
-    return result
-
-
-@functools.lru_cache(maxsize=2 * OPEN)
-def _line_views(folder: Path, version: str, replay: Analysis, now: str, line: int) -> replays.LineViews:
-    return replays.LineViews(_read(folder, version), _result(folder, replay, now), line)
-
-
-@functools.lru_cache(maxsize=1000)  # a few kB each, so that a list of recordings need not be read again
-def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any]:
-    recording = _read(folder, version)
-    return summary.figures(recording, _covered(folder, version, cuts)[0])
-
-
-@functools.lru_cache(maxsize=1000)
-def _road(folder: Path, version: str, cuts: tuple[Cut, ...], now: str) -> dict[str, Any]:
-    recording = _read(folder, version)
-    return summary.road_of(_result(folder, LANE, now), recording.images[:, 0], _covered(folder, version, cuts)[0])
-
-
-@functools.lru_cache(maxsize=1000)
-def _error(folder: Path, version: str, cuts: tuple[Cut, ...], analysis: Analysis, now: str) -> float | None:
-    """Return the root mean square of the difference of a model's steering from the driver's; None if it is unknown."""
-    recording = _read(folder, version)
-    difference = _result(folder, analysis, now).column("steering", recording.images[:, 0]) - recording.steering
-    known = difference[~np.isnan(difference) & ~_covered(folder, version, cuts)[0]]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else None
-
-
-@functools.lru_cache(maxsize=1000)
-def _driven(folder: Path, version: str, analysis: Analysis, now: str) -> dict[str, Any]:
-    return replays.figures(_result(folder, analysis, now), _read(folder, version).images[:, 0])
