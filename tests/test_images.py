@@ -280,6 +280,12 @@ def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, 
     assert first in capsys.readouterr().out
 
 
+def test_a_log_among_its_images_is_to_be_moved_up(copied):
+    (copied / "driving_log.csv").rename(copied / "IMG" / "driving_log.csv")
+    told = check_images(read_recording(copied / "IMG")).rejected[0].detail
+    assert told.endswith(f"missing; move driving_log.csv from {copied}/IMG to the folder above")
+
+
 def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied, tmp_path):
     log = copied / "driving_log.csv"
     log.write_bytes(log.read_bytes().replace(b"_2018", b"_\xff018", 18))

@@ -104,6 +104,8 @@ def _remedies(folder: Path) -> Callable[[str], str]:
 
     def remedy(name: str) -> str:
         similar = present.get(name.lower(), folder / name)
+        if similar.parent == folder.parent and folder.parent.name == IMAGE_FOLDER:
+            return f"move {DRIVING_LOG} from {folder.parent} to the folder above"
         if similar.parent != folder:
             return f"move the images from {similar.parent} to {folder}"
         if similar.name != name:
