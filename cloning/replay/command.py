@@ -115,7 +115,7 @@ def drive_at_limits(
 
     def drive_along(number: int, line: ReferenceLine) -> None:
         begin = functools.partial(LineDrive, recording, line, driver, disturbance, number)
-        here, anew, rows = begin(), list[Drive](), len(drives[limits[-1]].row)
+        here, anew, before = begin(), list[Drive](), len(drives[limits[-1]].row)  # rows, of the lines before
         with ForkedDrives(drives) as forked:
 
             def after_row(frame: ReplayFrame, done: Drive) -> None:
@@ -127,7 +127,7 @@ def drive_at_limits(
             part = functools.partial(forked.start, here) if parallel else anew.extend
             here.go_on([*drives.values()], after_row, part)
             for done in anew:
-                done.cut(rows)
+                done.cut(before)
                 begin().go_on([done], lambda *_: bar.update())
             forked.collect(None)
 
