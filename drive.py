@@ -15,6 +15,7 @@ import argparse
 import gc
 import itertools
 import logging
+import reprlib
 import statistics
 import time
 from collections import Counter
@@ -65,7 +66,7 @@ class Session(page.Session):
         self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
-        self.puzzled = False  # whether `tell_of_silence` has told of it
+        self.puzzled = False  # whether the log tells that it may be another simulator
         self.warned: Counter[str] = Counter()  # kinds of warnings logged: see terminal.Few
         self.folders: list[saved_frames.SessionFolder] = []  # of its saved frames; the last one may be `folder`
 
@@ -186,6 +187,7 @@ class DriveServer:
         self.socket = server.Server()
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
+        self.socket.on("*", self.other_event)
         self.socket.on("disconnect", self.disconnect)
         self.app = server.socketio.WSGIApp(self.socket, page.create_app(self, server.eventlet.sleep))
         # The first pass is slow: do it before the first frame.
@@ -211,6 +213,17 @@ class DriveServer:
             self.socket.emit("manual", {}, room=sid)
         else:
             self.socket.emit("steer", session.answer(message, self.socket.arrived(sid)), room=sid)
+
+    def other_event(self, event: object, sid: str, *_: object) -> object:
+        """Leave an event unanswered; log the first one of a client that has sent no telemetry."""
+        session = self.sessions.get(sid)
+        if session and not session.heard and not session.puzzled:
+            session.puzzled = True
+            log.warning(
+                f"a client sends {reprlib.repr(event)}, which is not answered: the simulator of term 1 sends telemetry",
+                extra={"warned": session.warned},
+            )
+        return self.socket.not_handled
 
     def disconnect(self, sid: str, *_: object) -> None:
         """Forget a session and log its summary."""

@@ -96,9 +96,10 @@ def test_unusable_telemetry_gets_the_last_steering_and_no_throttle_and_its_reaso
     assert float(before["throttle"]) > 0
     png = cv2.imencode(".png", decoded(jpeg))[1].tobytes()
     images = (None, 5, "", "/9j/4AAQ*" + good["image"], "ärger")
+    missing = "is missing, which the simulator of term 1 sends"
     broken: list[tuple[object, str]] = [
         *((message, "not a JSON object") for message in ([1, 2], "telemetry", 7, True)),
-        *(({key: good[key] for key in good if key != lost}, f"{lost} is missing") for lost in ("image", "speed")),
+        *(({key: good[key] for key in good if key != lost}, f"{lost} {missing}") for lost in ("image", "speed")),
         *(({**good, "speed": speed}, "speed is not a number") for speed in ("fast", None, "NaN", "1e999", np.inf)),
         *(({**good, "image": image}, "image") for image in images),
         ({**good, "image": good["image"][:4000]}, "cut short"),

@@ -175,7 +175,7 @@ def test_the_state_is_what_happens(network, jpegs, monkeypatch):
     server.disconnect("sid")
     assert state() == state(1000) == "gone"
     figures = drive_page.figures(server, server.watched_session(), time.monotonic())
-    assert (figures["frames"], figures["unusable"], figures["reason"]) == (2, 2, "speed is missing")
+    assert (figures["frames"], figures["unusable"]) == (2, 2) and figures["reason"].startswith("speed is missing")
 
 
 @pytest.mark.parametrize("tick", [1e-9, 1 / 64])  # s: of the clock; up to Python 3.12 the latter on Windows

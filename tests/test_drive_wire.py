@@ -185,6 +185,27 @@ def test_a_simulator_that_may_expect_numbers_is_told_of(server, jpegs):
         awaited(lambda: any("if it is Udacity's term-2 simulator" in line for line in server.lines))
 
 
+def test_an_image_as_bytes_is_answered_and_told_of(server, jpegs):
+    """As programs send it that forget to decode what base64 gives them, and browsers that send a Blob."""
+    with Simulator(server.port).open() as simulator:
+        last = simulator.drive(telemetry(jpegs[0]))["steering_angle"]
+        simulator.send('451-["telemetry",{"speed":"9","image":{"_placeholder":true,"num":0}}]')
+        assert json.loads(simulator.receive()[2:]) == ["steer", {"steering_angle": last, "throttle": "0"}]
+        awaited(lambda: any("sent as bytes, not as base64 text" in line for line in server.lines))
+
+
+def test_a_client_that_sends_no_telemetry_is_told_of(server, jpegs, steering):
+    """As the simulators of udacity-gym and AutoDRIVE, which connect to the same port."""
+    with Simulator(server.port).open() as simulator:
+        for event in ("car_telemetry", "\\u001b[2J" + "x" * 1000, "other"):
+            simulator.send(f'427["{event}",{{"speed":0}}]')
+        simulator.send("2")
+        assert simulator.receive() == "3", "no acknowledgement, so that a client that sends many is disconnected"
+        awaited(lambda: any("a client sends 'car_telemetry', which is not answered" in line for line in server.lines))
+        assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
+    assert not any("'other'" in line or "xxx" in line for line in server.lines), "of each client the first"
+
+
 def test_it_listens_on_loopback_alone(server):
     def accepts(address: str, port: int) -> bool:
         try:

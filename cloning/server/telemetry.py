@@ -13,7 +13,8 @@ from cloning.recordings.images import decode
 from cloning.wire.protocol import MAX_NAME, STAND_IN, Place
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
-UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
+MISSING = "is missing, which the simulator of term 1 sends"
+UNREADABLE = object()  # what the server gives for a telemetry that is too long, not JSON or in several parts
 NUMERIC_FIELDS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two as applied at the moment
 
 # The simulator formats with "N4" of the machine's culture. Mono 6.8 writes -12.3456 as `12.3456-` in 16 Arabic cultures
@@ -55,7 +56,7 @@ def parse_telemetry(message: object) -> Telemetry:
     speed = parse_speed(message)
     assert isinstance(message, dict), "a message with a speed is one"
     if "image" not in message:
-        raise UnusableTelemetry("image is missing")
+        raise UnusableTelemetry(f"image {MISSING}")
     try:
         cte, _ = parse_number(message.get("cte"))
     except ValueError:
@@ -74,11 +75,14 @@ def parse_telemetry(message: object) -> Telemetry:
 def parse_speed(message: object) -> float:
     """Return the speed in a telemetry message, mph, whatever its image is. Raises UnusableTelemetry."""
     if message is UNREADABLE:
-        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
+        raise UnusableTelemetry(
+            f"its JSON is incomplete, it is longer than {MAX_MESSAGE} bytes, or its image is sent as bytes, "
+            "not as base64 text"
+        )
     if not isinstance(message, dict):
         raise UnusableTelemetry("it is not a JSON object")
     if "speed" not in message:
-        raise UnusableTelemetry("speed is missing")
+        raise UnusableTelemetry(f"speed {MISSING}")
     try:
         return parse_number(message["speed"])[0]
     except ValueError as error:
