@@ -40,7 +40,8 @@ from cloning.server.speed import SpeedController
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_speed, parse_telemetry
 from cloning.wire.protocol import PORT
 
-KERAS = (".h5", ".hdf5", ".keras")  # endings of files that other projects' drive.py takes
+# By the endings of files that other projects' drive.py takes, and of those that cloning.network.export makes.
+FOREIGN = {".h5": "Keras", ".hdf5": "Keras", ".keras": "Keras", ".json": "Keras", ".onnx": "ONNX"}
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 SLOWEST_MPH = 5.0  # to which risk slows the car down, before it is stopped
 FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer
@@ -326,11 +327,11 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
     usual = DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
     if argument is None:
         return usual
-    if argument.suffix in KERAS:
+    if kind := FOREIGN.get(argument.suffix):
         raise UserError(
-            f"{argument}: a model of Keras, which PyTorch can't read; `python model.py` trains one that drives"
+            f"{argument}: a model of {kind}, which PyTorch can't read; `python model.py` trains one that drives"
         )
-    if folder is None and not argument.is_file() and argument.suffix != ".pt":
+    if folder is None and not argument.is_file() and argument.suffix not in (".pt", ".pth"):
         command = as_typed("python", "drive.py", usual, argument)
         raise UserError(
             f"{argument}: not a model file; name the model first and the folder for the frames second: `{command}`"

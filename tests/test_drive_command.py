@@ -77,6 +77,10 @@ def test_which_model_drives(jpegs, tmp_path, monkeypatch):
     for folder in ("run1", "run2"):
         with pytest.raises(UserError, match=f"`python drive.py model.pt {folder}`"):
             drive.choose_model(Path(folder), None)
+    assert drive.choose_model(Path("none.pth"), None) == Path("none.pth"), "no folder either"
+    for other, kind in (("model.h5", "Keras"), ("model.json", "Keras"), ("model.onnx", "ONNX")):
+        with pytest.raises(UserError, match=f"{other}: a model of {kind}, which PyTorch can't read"):
+            drive.choose_model(Path(other), None)
 
 
 @pytest.mark.parametrize("text", ["model.pt run1 --port 1", "model.pt --port 1 run1", "--port 1 model.pt run1"])
