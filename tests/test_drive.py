@@ -26,6 +26,7 @@ from cloning.road.camera import project_ground
 from cloning.road.overlay import overlay
 from cloning.road.points import make_road
 from cloning.road.track import Track
+from cloning.server.status_line import StatusLine
 from cloning.server.telemetry import parse_place
 from cloning.server.terminal import MAX_PER_MINUTE, Few, Unblocked
 from cloning.wire.client import telemetry_packet
@@ -250,7 +251,7 @@ def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight
     for _ in range(3):
         session.answer(telemetry(jpeg), time.perf_counter() - 0.04)
     longest = 1000 * (time.perf_counter() - begin + 0.04)
-    status = drive.StatusLine(session.server, printed())
+    status = StatusLine(session.server, printed())
     shown = [float(part.split()[0]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
     on_the_page = [frame.latency for frame in session.history]
     assert shown == [pytest.approx(np.mean(on_the_page), abs=0.06)]
@@ -259,7 +260,7 @@ def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight
 
 def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg):
     stderr = printed()
-    status = drive.StatusLine(session.server, stderr)
+    status = StatusLine(session.server, stderr)
     status.time -= 3600  # an hour of waiting for a simulator
     session.server.sessions["sid"] = session
     session.answer(telemetry(jpeg))
@@ -285,7 +286,7 @@ def test_escape_sequences_are_for_terminals_only(session, jpeg):
     for is_terminal in (True, False):
         stderr = printed()
         stderr.is_terminal = is_terminal
-        status = drive.StatusLine(session.server, stderr)
+        status = StatusLine(session.server, stderr)
         status.time -= 3600
         status.update()
         assert ("\033" in shown(stderr)) is is_terminal
