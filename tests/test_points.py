@@ -65,6 +65,11 @@ def test_forms_of_a_file_give_the_same_road(tmp_path):
         "c.json": json.dumps(BEND),
         "d": json.dumps({"road_points": BEND, "risk": "anything"}),
         "e.road": "@".join(f"{x},0.0,{y}" for x, y in BEND),  # y is up
+        "objects.json": json.dumps({"road_points": [{"sequenceNumber": 1, "x": x, "y": y} for x, y in BEND]}),
+        "spaces.txt": "0 0\n30.0   0\n55\t8\n 80 30 \n",
+        "track.csv": "# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,4,5\n30,0,4,5\n55,8,4,5\n80,30,4,5\n",
+        "raceline.csv": "# 3e7d\n#\n# s_m; x_m; y_m; psi\n0; 0; 0; 1\n30; 30; 0; 1\n56; 55; 8; 1\n90; 80; 30; 1\n",
+        "poses.csv": '"x","y","z","yaw","note"\n0,0,0,1,\n30,0,0,1,a\n# half\n55,8,0,1,b\n80,30,0,1,\n',
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
@@ -95,9 +100,9 @@ REFUSED = [
     ({"points": [(0, 0), (19.99, 0)]}, "19.99 m long; it must be 20 to 5000 m"),
     ({"points": [(0, 0), (9000, 0)]}, "9000 m long"),
     ({"points": [(i, 0, i % 2 * 9000) for i in range(401)], "checked": False}, "climbs and falls by 3600000.0 m"),
-    ({"points": [(0, 0)]}, "1 different points; a road needs 2"),
-    ({"points": []}, "0 different points"),
-    ({"points": [(0, 0), (30, 0), (0, 0)]}, "2 different points; a road needs 2, and a closed one 3"),
+    ({"points": [(0, 0)]}, "1 points that are 0.01 m apart; a road needs 2"),
+    ({"points": []}, "0 points that are"),
+    ({"points": [(0, 0), (30, 0), (0, 0)]}, "2 points that are 0.01 m apart; a road needs 2, and a closed one 3"),
     ({"points": [(0, 0), (60, 0), (30, 50), (0, 0)], "closed": False}, "needs 9 m$"),
     ({"points": [(0, 0, 0), (30, 0, 20)]}, "too steep"),
     ({"points": [(0, 0), (math.nan, 0)]}, "point 2 is"),
@@ -121,17 +126,23 @@ def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("0,0\n30;0\n", "line 2: 30;0 is not a point"),
+        ("0,0\n30:0\n", "line 2: 30:0 is not a point"),
+        ("0;0\n30,5;0,5\n", "line 2: 30,5;0,5 is not a point"),
         ("0,0\n30,0\nfoo\n", "line 3: foo"),
         ("0,0,0@30,0@60,0,0", "point 2: '30,0' is not x,y,z"),
         ('{"road_points": [[0, 0], [30, 0]', "not JSON"),
         ('{"points": [[0, 0], [30, 0]]}', 'under the key "road_points"'),
+        ('[{"road_points": [{"x": 0, "y": 0}]}]', "no list of one road's points"),
         ('{"road_points": [[0, 0], [30, 0]], "closed": 1}', "closed 1: it must be true or false"),
-        ("", "0 different points"),
-        ("\x00\x01", "line 1: .* is not a point x,y or x,y,z, nor a line of these names"),
-        ("s,x,y\n0,0,0\n30,30,0\n", "line 1: s,x,y is not a point x,y or x,y,z, nor a line of these names"),
+        ("", "0 points that are"),
+        ("\x00\x01", "line 1: .* is not a point x,y or x,y,z, nor a line of the columns' names"),
+        ("lat,lon\n48,11\n", "line 1: lat,lon is not a point x,y or x,y,z, nor a line of the columns' names"),
+        ("x,y,x_m\n0,0,0\n30,30,0\n", "line 1: x,y,x_m is not a point"),
+        ("# a road\n0 0 0 50\n", "line 2: 0 0 0 50 is not .* names, such as x,y,z,speed; begin with one"),
+        ("0,0\n30,0,0,50\n", "line 2: 30,0,0,50 is not a point"),
+        ("0,0.7,0\n0,0.7,30\n20,0.7,60\n", "too steep, .*; if z is not the height, .* x,z,y or x,y,speed"),
         ("x,y\n0,0,0\n30,30,0\n", "line 2: 0,0,0 is not a point"),
-        ("0" * 200_000, "not CSV: field larger than"),
+        ("0" * 200_000 + ",0", "line 1: not CSV: field larger than"),
     ],
 )
 def test_what_is_no_file_of_points_is_refused(text, reason, tmp_path):

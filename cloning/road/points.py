@@ -6,9 +6,10 @@
 
 A file has one of three forms, whatever its name:
 
-* CSV: a line x,y or x,y,z (z up) for each point, below a line with these names, in any order, or none
-* JSON: a list of such points, or an object that has it as "road_points", and may have "width", "marking", "land" and
-  "closed" beside it; other keys are ignored
+* CSV: a line x,y or x,y,z (z up) for each point, with commas, semicolons or spaces. A line of the columns' names above
+  them (x or x_m, and so on; also after #) gives another order, or names columns that are ignored. # begins a comment
+* JSON: a list of such points, or of objects with "x" and "y", or an object that has it as "road_points", and may have
+  "width", "marking", "land" and "closed" beside it; other keys are ignored
 * the text x,y,z@x,y,z@… that programs of road tests send to the simulator, in which y is the height
 
 The points are in metres. A road whose last point is its first one is a closed loop.
@@ -36,6 +37,8 @@ MAX_GRADE = 0.4  # dz/ds; the real simulator's steepest road has 0.3
 SHOULDER = 1.0  # m between the edges of two parts of a road
 SAME_POINT = 0.01  # m: nearer points are one
 LEADS = (30.0, 15.0, 5.0)  # m: an open road goes on so far beyond its ends, if there is room
+AXES = ("x", "y", "z")
+NAMES = "the columns' names, such as x,y,z,speed"
 MAX_BYTES = 4_000_000  # of a file
 SPLINE_PIECES = 10  # points of a spline between two nodes
 
@@ -69,7 +72,8 @@ def make_road(
         numbers = numbers[:-1]
     closed = ends_meet if closed is None else bool(closed)
     if len(numbers) < (3 if closed else 2):
-        raise TrackError(f"{len(numbers)} different points; a road needs 2, and a closed one 3")
+        found = f"{len(numbers)} points that are {SAME_POINT:g} m apart"
+        raise TrackError(f"{found}; a road needs 2, and a closed one 3")
     if not isinstance(width, int | float | np.integer | np.floating) or not MIN_WIDTH <= width <= MAX_WIDTH:
         raise TrackError(f"width {width!r}: it must be {MIN_WIDTH:g} to {MAX_WIDTH:g} (m)")
     for kind, value, known in (("marking", marking, MARKINGS), ("land", land, LANDS)):
@@ -147,7 +151,9 @@ def _fault(road: PointRoad) -> str:
 
     steepest = int(np.abs(track.grade).argmax())
     if abs(track.grade[steepest]) > MAX_GRADE:
-        return f"the road is too steep, {place(steepest)}: {track.grade[steepest]:.2f} m a metre, of {MAX_GRADE:g}"
+        grade = f"{track.grade[steepest]:.2f} m a metre, of {MAX_GRADE:g}"
+        remedy = "if z is not the height, begin a CSV with its columns' names, such as x,z,y or x,y,speed"
+        return f"the road is too steep, {place(steepest)}: {grade}; {remedy}"
     flat = track.points[:, :2]
     for side in (-1, 1):
         edge = flat + side * road.width / 2 * track.rightward
@@ -205,32 +211,46 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
             raise TrackError(f"not JSON: {str(error)[:100]}") from None
         own = found if isinstance(found, dict) else {"road_points": found}
         points = own.get("road_points")
-        if not isinstance(points, list) or not all(isinstance(point, list) for point in points):
-            raise TrackError('no list of points, or none under the key "road_points"')
+        if isinstance(points, list):
+            points = [_in_order(point) if isinstance(point, dict) else point for point in points]
+        if not isinstance(points, list) or not all(isinstance(point, list) and point for point in points):
+            raise TrackError('no list of one road\'s points, nor one under the key "road_points"')
         if not isinstance(own.get("closed", False), bool):
             raise TrackError(f"closed {own['closed']!r}: it must be true or false")
         return points, {key: own[key] for key in ("closed", "width", "marking", "land") if key in own}
     if "@" in text:
         return parse_track_string(text), {}
-    try:
-        lines = list(csv.reader(text.splitlines()))
-    except csv.Error as error:  # a line that is no point
-        raise TrackError(f"not CSV: {error}") from None
-    rows = [(number, row) for number, row in enumerate(lines, 1) if any(map(str.strip, row))]
-    names = [name.strip().lower() for name in rows[0][1]] if rows else []
-    if sorted(names) in (["x", "y"], ["x", "y", "z"]):
-        rows = rows[1:]
-    else:
-        names = []
-    points = []
-    for number, row in rows:
+    return _parse_table(text), {}
+
+
+def _parse_table(text: str) -> list[list[float]]:
+    """Return the points in the lines of a CSV. Raises TrackError."""
+    points, names = list[list[float]](), list[str]()
+    for number, line in enumerate(text.splitlines(), 1):
+        content, separator = line.strip().lstrip("# "), next((mark for mark in ";," if mark in line), None)
         try:
-            point = [float(field) for field in row]
-            points.append([value for _, value in sorted(zip(names, point, strict=True))] if names else point)
-        except ValueError:
-            what = f"line {number}: {','.join(row)[:60]} is not a point x,y or x,y,z"
-            raise TrackError(what if points else f"{what}, nor a line of these names") from None
-    return points, {}
+            fields = next(csv.reader([content], delimiter=separator), []) if separator else content.split()
+        except csv.Error as error:  # a line that is no point
+            raise TrackError(f"line {number}: not CSV: {error}") from None
+        found = [field.strip().lower().removesuffix("_m") for field in fields]
+        if not points and sorted(name for name in found if name in AXES) in (["x", "y"], ["x", "y", "z"]):
+            names = found
+        elif any(found) and not line.lstrip().startswith("#"):
+            try:
+                row = _in_order(dict(zip(names, fields, strict=True))) if names else fields
+                if len(row) not in (2, 3):
+                    raise ValueError
+                points.append([float(field) for field in row])
+            except ValueError:
+                what = f"line {number}: {line.strip()[:60]} is not a point x,y or x,y,z"
+                remedy = "" if points or names else f", nor a line of {NAMES}; begin with one"
+                raise TrackError(what + remedy) from None
+    return points
+
+
+def _in_order(values: dict[str, Any]) -> list[Any]:
+    """Return the values that are named x, y and z, as far as there are such ones."""
+    return [values[name] for name in AXES if name in values]
 
 
 def parse_track_string(text: str) -> list[list[float]]:
