@@ -149,6 +149,7 @@ def test_another_cars_data_set_becomes_a_recording_and_what_does_not_fit_is_told
     command += ["--camera", CENTER]
     for names, shown in (
         ({"x": 2, "wheel": 0, "gas": 1}, "wheel, action:gas, action:x"),
+        ([["wheel", "gas", "x"]], "wheel, action:gas, action:x"),
         (None, "0, action:1, action:2"),
     ):
         edit(data_set, features=kept | {"action": kept["action"] | {"names": names}})
@@ -250,6 +251,20 @@ def test_a_tubs_camera_of_another_name_is_found_or_can_be_named(tub, tmp_path):
     rename("cam/left", "cam/right")
     assert refused(tub, "--output", tmp_path / "b").endswith("Name it with --camera: cam/left, cam/right")
     assert "b: 9 rows" in converted(tub, "--output", tmp_path / "b", "--camera", "cam/left")
+
+
+def test_a_tub_of_donkeycars_computer_vision_template_has_the_angle_under_another_name(tub, tmp_path):
+    for catalog in tub.glob("*.catalog"):
+        text = catalog.read_text(encoding="utf-8").replace("user/angle", "steering").replace("user/thr", "thr")
+        catalog.write_text(text, encoding="utf-8")
+    assert "no throttle" not in converted(tub, "--output", tmp_path / "recording")
+    recording = checked(tmp_path / "recording")
+    assert recording.steering[0] == -0.5 and recording.throttle[0] == np.float32(0.3)
+
+
+def test_of_several_tubs_in_a_folder_one_is_to_be_named(tub, written, tmp_path):
+    assert refused(tub.parent, "--output", tmp_path / "recording") == f"{tub.parent}: name one alone: {tub}"
+    assert refused(written.parent, "--output", tmp_path / "recording").endswith(f"name one alone: {written}")
 
 
 def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):

@@ -24,7 +24,7 @@ from cloning.lerobot.drives import MANIFEST, read_driven, read_tub
 from cloning.lerobot.source import write_recording
 from cloning.recordings.check import check_images
 from cloning.recordings.format import LANE_FILE
-from cloning.recordings.log import find_folders, print_findings, read_recording
+from cloning.recordings.log import find_folders, folders_below, print_findings, read_recording
 from cloning.recordings.saved_frames import DRIVEN
 
 OPTIONS = {"camera": ("data set", "tub"), "steering": ("data set",), "full_lock": ("data set", "tub")}  # of what
@@ -47,11 +47,17 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
+def kind_of(folder: Path) -> str:
+    """Return what a folder is, by the files in it."""
+    files = {"tub": MANIFEST, "drive": DRIVEN, "data set": "meta/info.json"}
+    return next((kind for kind, name in files.items() if (folder / name).is_file()), "recording")
+
+
 def main() -> int:
     """Write the data set or recording; return the exit status."""
     arguments = parse_arguments()
     source, output, notes = Path(arguments.source[0]), arguments.output, Counter[str]()
-    is_tub, is_data_set = (source / MANIFEST).is_file(), (source / "meta" / "info.json").is_file()
+    kind = kind_of(source)
     if not source.exists():
         raise UserError(f"{source}: no such folder; name a recording, data set, tub or drive")
     if any(source.glob("record_*.json")):
@@ -59,22 +65,23 @@ def main() -> int:
         raise UserError(f"{source}: a tub of version 1; {remedy}")
     if output.exists():
         raise OutputError(f"{output}: exists already; name another folder, or delete this one")
-    is_drive = (source / DRIVEN).is_file()
-    kind = "tub" if is_tub else "drive" if is_drive else "data set" if is_data_set else "recording"
     if kind != "recording" and len(arguments.source) > 1:
         raise UserError(f"{source} is a {kind}: name it alone")
     for option, kinds in OPTIONS.items():
         if getattr(arguments, option) is not None and kind not in kinds:
             raise UserError(f"--{option.replace('_', '-')} is of a {' or '.join(kinds)}, not of a {kind}; leave it out")
-    if is_drive:
+    if kind == "drive":
         samples = read_driven(source, notes)
-    elif is_tub:
+    elif kind == "tub":
         samples = read_tub(source, arguments.camera, notes)
     else:
         from cloning.lerobot.dataset import write_data_set
         from cloning.lerobot.reader import read_data_set
 
-        if not is_data_set:
+        if kind == "recording":
+            inner = [str(folder) for folder in sorted(source.glob("*")) if kind_of(folder) in ("tub", "data set")]
+            if inner and not any(folders_below(source)):
+                raise UserError(f"{source}: name one alone: {', '.join(inner)}")
             recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
             for recording in recordings:
                 print_findings(recording)
