@@ -279,6 +279,7 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
     [
         (lambda folder: (folder / "meta/info.json").write_bytes(b"{"), "not a data set in LeRobot"),
         (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").write_bytes(b"PAR1"), "copy it again"),
+        (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").unlink(), "parquet: no such file; copy it"),
         (lambda folder: shutil.rmtree(folder / "videos" / CENTER), "No such file or directory"),
         (lambda folder: edit(folder, features=[]), "not a data set in LeRobot"),
         (lambda folder: edit(folder, fps=0), "not a data set in LeRobot"),
@@ -287,7 +288,7 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
         (lambda folder: edit(folder, features=features(folder) | VAST), "action:999, recorded_at:recorded_at"),
         (lambda folder: edit(folder, video_path="http://127.0.0.1:1/film"), "127.0.0.1:1/film: No such file"),
     ],
-    ids=["info", "table", "no film", "no features", "no rate", "short film", "gap", "million numbers", "no file"],
+    ids=["info", "table", "no table", "film", "features", "rate", "short film", "gap", "vast", "no file"],
 )
 def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, monkeypatch, damage, message):
     damage(data_set)

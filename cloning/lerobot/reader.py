@@ -34,6 +34,8 @@ def read_data_set(folder: Path, camera: str | None, steering: str | None) -> Ite
         yield from _rows(folder, info, _cameras(info, camera), _columns(info, steering))
     except av.FFmpegError as error:
         raise RecordingError(f"{error.filename or folder}: {error.strerror}; copy the film again") from error
+    except FileNotFoundError as error:  # of PyArrow, without the reason
+        raise RecordingError(f"{error.filename or error}: no such file; copy it again") from error
     except WRONG as error:
         problem = f"{type(error).__name__}: {error}"
         raise RecordingError(f"not a data set in LeRobot's format v3 or v2: {problem}; copy it again") from error
