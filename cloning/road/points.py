@@ -31,7 +31,7 @@ from cloning.road.track import Track
 
 WIDTH, MARKING, LAND = 8.0, "white", "meadow"  # m: two lanes, as road tests have them
 MIN_WIDTH, MAX_WIDTH = 5.0, 12.0  # m: room for the car, and for the scenery beside the road
-MIN_LENGTH, MAX_LENGTH = 20.0, 5000.0  # m
+MIN_LENGTH, MAX_LENGTH = 20.0, 8000.0  # m: Spa has 7000
 FARTHEST = 10_000.0  # m from (0, 0): further away the render engine's numbers get coarse
 MAX_GRADE = 0.4  # dz/ds; the real simulator's steepest road has 0.3
 SHOULDER = 1.0  # m between the edges of two parts of a road
