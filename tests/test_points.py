@@ -67,6 +67,7 @@ def test_forms_of_a_file_give_the_same_road(tmp_path):
         "d": json.dumps({"road_points": BEND, "risk": "anything"}),
         "e.road": "@".join(f"{x},0.0,{y}" for x, y in BEND),  # y is up
         "objects.json": json.dumps({"road_points": [{"sequenceNumber": 1, "x": x, "y": y} for x, y in BEND]}),
+        "prose.txt": "# x and y in metres\n0 0\n30 0\n55 8\n80 30\n",
         "spaces.txt": "0 0\n30.0   0\n55\t8\n 80 30 \n",
         "track.csv": "# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,4,5\n30,0,4,5\n55,8,4,5\n80,30,4,5\n",
         "raceline.csv": "# 3e7d\n#\n# s_m; x_m; y_m; psi\n0; 0; 0; 1\n30; 30; 0; 1\n56; 55; 8; 1\n90; 80; 30; 1\n",
@@ -140,6 +141,7 @@ def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
         ("lat,lon\n48,11\n", "line 1: lat,lon is not a point x,y or x,y,z, nor a line of the columns' names"),
         ("x,y,x_m\n0,0,0\n30,30,0\n", "line 1: x,y,x_m is not a point"),
         ("# a road\n0 0 0 50\n", "line 2: 0 0 0 50 is not .* names, such as x,y,z,speed; begin with one"),
+        ("# x,y,v\n0,0,1\n30,0\n60,0,1\n", "line 3: 30,0 is not a point"),
         ("0,0\n30,0,0,50\n", "line 2: 30,0,0,50 is not a point"),
         ("0,0.7,0\n0,0.7,30\n20,0.7,60\n", "too steep, .*; if z is not the height, .* x,z,y or x,y,speed"),
         ("x,y\n0,0,0\n30,30,0\n", "line 2: 0,0,0 is not a point"),

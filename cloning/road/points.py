@@ -225,17 +225,20 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
 
 def _parse_table(text: str) -> list[list[float]]:
     """Return the points in the lines of a CSV. Raises TrackError."""
-    points, names = list[list[float]](), list[str]()
+    points, names, in_comment = list[list[float]](), list[str](), False
     for number, line in enumerate(text.splitlines(), 1):
         content, separator = line.strip().lstrip("# "), next((mark for mark in ";," if mark in line), None)
+        comment = line.lstrip().startswith("#")
         try:
             fields = next(csv.reader([content], delimiter=separator), []) if separator else content.split()
         except csv.Error as error:  # a line that is no point
             raise TrackError(f"line {number}: not CSV: {error}") from None
         found = [field.strip().lower().removesuffix("_m") for field in fields]
         if not points and sorted(name for name in found if name in AXES) in (["x", "y"], ["x", "y", "z"]):
-            names = found
-        elif any(found) and not line.lstrip().startswith("#"):
+            names, in_comment = found, comment
+        elif any(found) and not comment:
+            if in_comment and not points and len(names) != len(fields):
+                names = []  # it was a sentence
             try:
                 row = _in_order(dict(zip(names, fields, strict=True))) if names else fields
                 if len(row) not in (2, 3):
