@@ -49,7 +49,7 @@ def _shared_options() -> list[argparse.ArgumentParser]:
     text = f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)"
     add("--track", help=text)
     text = (
-        "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
+        "drive a road of your own: its centre line's points in m, as CSV (x,y or x,y,z, z up; or columns so named), "
         "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there"
     )
     add("--road", metavar="FILE", help=text)

@@ -67,7 +67,7 @@ def test_forms_of_a_file_give_the_same_road(tmp_path):
         "d": json.dumps({"road_points": BEND, "risk": "anything"}),
         "e.road": "@".join(f"{x},0.0,{y}" for x, y in BEND),  # y is up
         "objects.json": json.dumps({"road_points": [{"sequenceNumber": 1, "x": x, "y": y} for x, y in BEND]}),
-        "prose.txt": "# x and y in metres\n0 0\n30 0\n55 8\n80 30\n",
+        "prose.txt": "# x and y in metres, by me@home\n0 0\n30 0\n55 8\n80 30\n",
         "spaces.txt": "0 0\n30.0   0\n55\t8\n 80 30 \n",
         "track.csv": "# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,4,5\n30,0,4,5\n55,8,4,5\n80,30,4,5\n",
         "raceline.csv": "# 3e7d\n#\n# s_m; x_m; y_m; psi\n0; 0; 0; 1\n30; 30; 0; 1\n56; 55; 8; 1\n90; 80; 30; 1\n",

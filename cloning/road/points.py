@@ -218,7 +218,7 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
         if not isinstance(own.get("closed", False), bool):
             raise TrackError(f"closed {own['closed']!r}: it must be true or false")
         return points, {key: own[key] for key in ("closed", "width", "marking", "land") if key in own}
-    if "@" in text:
+    if "@" in text and not text.lstrip().startswith("#"):
         return parse_track_string(text), {}
     return _parse_table(text), {}
 
