@@ -1,4 +1,4 @@
-"""What the benchmark drives. Another task, look or limit makes another VERSION, whose scores are not comparable."""
+"""What the benchmark drives. Another task, look, limit or disturbance makes another VERSION of the rules."""
 
 import functools
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from cloning.road.track import ROADS, Track
 from simulator.driving import Conditions
 from simulator.scenery.looks import SHADOWED
 
-VERSION = 2
+VERSION = 3
 GROUPS = {
     "tracks": "lake and jungle in unknown looks, with and without shadows",
     "roads": "unknown generated roads, of which mountain roads with hairpins at 25 mph",
