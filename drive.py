@@ -214,9 +214,12 @@ class DriveServer:
         else:
             self.socket.emit("steer", session.answer(message, self.socket.arrived(sid)), room=sid)
 
-    def other_event(self, event: object, sid: str, *_: object) -> object:
-        """Leave an event unanswered; log the first one of a client that has sent no telemetry."""
-        session = self.sessions.get(sid)
+    def other_event(self, event: object, sid: object = None, *_: object) -> object:
+        """Leave an event unanswered; log the first one of a client that has sent no telemetry.
+
+        An event called "*", for which there is a handler, comes without its name: then sid is what the client sent.
+        """
+        session = self.sessions.get(sid) if isinstance(sid, str) else None
         if session and not session.heard and not session.puzzled:
             session.puzzled = True
             log.warning(

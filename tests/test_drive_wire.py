@@ -196,14 +196,18 @@ def test_an_image_as_bytes_is_answered_and_told_of(server, jpegs):
 
 def test_a_client_that_sends_no_telemetry_is_told_of(server, jpegs, steering):
     """As the simulators of udacity-gym and AutoDRIVE, which connect to the same port."""
+    before = len(server.lines)
     with Simulator(server.port).open() as simulator:
         for event in ("car_telemetry", "\\u001b[2J" + "x" * 1000, "other"):
             simulator.send(f'427["{event}",{{"speed":0}}]')
+        for data in ("", ",{}", ',"x"'):
+            simulator.send(f'42["*"{data}]')
         simulator.send("2")
         assert simulator.receive() == "3", "no acknowledgement, so that a client that sends many is disconnected"
         awaited(lambda: any("a client sends 'car_telemetry', which is not answered" in line for line in server.lines))
         assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
     assert not any("'other'" in line or "xxx" in line for line in server.lines), "of each client the first"
+    assert not any("Error" in line for line in server.lines[before:]), "even for an event *"
 
 
 def test_it_listens_on_loopback_alone(server):
