@@ -71,6 +71,7 @@ def test_forms_of_a_file_give_the_same_road(tmp_path):
         "spaces.txt": "0 0\n30.0   0\n55\t8\n 80 30 \n",
         "track.csv": "# x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,4,5\n30,0,4,5\n55,8,4,5\n80,30,4,5\n",
         "raceline.csv": "# 3e7d\n#\n# s_m; x_m; y_m; psi\n0; 0; 0; 1\n30; 30; 0; 1\n56; 55; 8; 1\n90; 80; 30; 1\n",
+        "units.csv": "x [m],y [m],v\n# by me@home\n0,0,1\n30,0,1\n55,8,1\n80,30,1\n",
         "poses.csv": '"x","y","z","yaw","note"\n0,0,0,1,\n30,0,0,1,a\n# half\n55,8,0,1,b\n80,30,0,1,\n',
     }
     for name, text in files.items():
@@ -83,6 +84,8 @@ def test_forms_of_a_file_give_the_same_road(tmp_path):
     assert (road.closed, road.width, road.marking, road.land) == (True, 6.5, "rail", "desert")
     heights = read_road(tmp_path / "e.road").points[:, 2]
     assert np.all(heights == 0)
+    (tmp_path / "heights.csv").write_text("# x, y, z (m)\n0,0,2\n30,0,2\n")
+    assert np.all(read_road(tmp_path / "heights.csv").points[:, 2] == 2)
 
 
 def test_equal_roads_are_equal_also_in_another_process():
@@ -135,6 +138,7 @@ def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
         ('{"road_points": [[0, 0], [30, 0]', "not JSON"),
         ('{"points": [[0, 0], [30, 0]]}', 'under the key "road_points"'),
         ('[{"road_points": [{"x": 0, "y": 0}]}]', "no list of one road's points"),
+        ('[{"y": 0, "z": 0}, {"y": 30, "z": 0}]', "no list of one road's points"),
         ('{"road_points": [[0, 0], [30, 0]], "closed": 1}', "closed 1: it must be true or false"),
         ("", "0 points that are"),
         ("\x00\x01", "line 1: .* is not a point x,y or x,y,z, nor a line of the columns' names"),

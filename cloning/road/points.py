@@ -7,7 +7,8 @@
 A file has one of three forms, whatever its name:
 
 * CSV: a line x,y or x,y,z (z up) for each point, with commas, semicolons or spaces. A line of the columns' names above
-  them (x or x_m, and so on; also after #) gives another order, or names columns that are ignored. # begins a comment
+  them (x, x_m or x [m], and so on; also after #) gives another order, or names columns that are ignored. Lines that
+  begin with # are comments
 * JSON: a list of such points, or of objects with "x" and "y", or an object that has it as "road_points", and may have
   "width", "marking", "land" and "closed" beside it; other keys are ignored
 * the text x,y,z@x,y,z@… that programs of road tests send to the simulator, in which y is the height
@@ -18,6 +19,7 @@ The points are in metres. A road whose last point is its first one is a closed l
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +40,7 @@ SHOULDER = 1.0  # m between the edges of two parts of a road
 SAME_POINT = 0.01  # m: nearer points are one
 LEADS = (30.0, 15.0, 5.0)  # m: an open road goes on so far beyond its ends, if there is room
 AXES = ("x", "y", "z")
+UNIT = re.compile(r"(_| ?[\[(])m[\])]?$")  # of a column, after its name
 NAMES = "the columns' names, such as x,y,z,speed"
 MAX_BYTES = 4_000_000  # of a file
 SPLINE_PIECES = 10  # points of a spline between two nodes
@@ -218,7 +221,7 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
         if not isinstance(own.get("closed", False), bool):
             raise TrackError(f"closed {own['closed']!r}: it must be true or false")
         return points, {key: own[key] for key in ("closed", "width", "marking", "land") if key in own}
-    if "@" in text and not text.lstrip().startswith("#"):
+    if "@" in text.partition("#")[0]:  # not in a comment
         return parse_track_string(text), {}
     return _parse_table(text), {}
 
@@ -233,7 +236,7 @@ def _parse_table(text: str) -> list[list[float]]:
             fields = next(csv.reader([content], delimiter=separator), []) if separator else content.split()
         except csv.Error as error:  # a line that is no point
             raise TrackError(f"line {number}: not CSV: {error}") from None
-        found = [field.strip().lower().removesuffix("_m") for field in fields]
+        found = [UNIT.sub("", field.strip().lower()) for field in fields]
         if not points and sorted(name for name in found if name in AXES) in (["x", "y"], ["x", "y", "z"]):
             names, in_comment = found, comment
         elif any(found) and not comment:
@@ -252,8 +255,8 @@ def _parse_table(text: str) -> list[list[float]]:
 
 
 def _in_order(values: dict[str, Any]) -> list[Any]:
-    """Return the values that are named x, y and z, as far as there are such ones."""
-    return [values[name] for name in AXES if name in values]
+    """Return the values that are named x, y and, if there is one, z; none without x and y."""
+    return [values[name] for name in AXES if name in values] if {"x", "y"} <= values.keys() else []
 
 
 def parse_track_string(text: str) -> list[list[float]]:
