@@ -139,6 +139,21 @@ def test_what_a_page_asks_for_again_and_again_is_computed_once(linked, tmp_path,
         assert asked() == first
 
 
+def test_a_log_that_grows_while_it_is_read_is_shown(linked, tmp_path, monkeypatch):
+    """As of a recording that is being made: its version is then older than its rows."""
+    (model := tmp_path / "model.pt").touch()
+    with opened(linked, model) as recording:
+        recording.analyses.pause()
+        monkeypatch.setattr(library.ShownRecording, "version", lambda _: "one")
+        recording.details()
+        log = linked / "driving_log.csv"
+        log.write_text("".join(log.read_text(encoding="utf-8").splitlines(keepends=True)[:-5]), encoding="utf-8")
+        steered(linked, model)
+        computed._read_once.cache_clear()  # as if other recordings had been looked at
+        assert recording.compared("1", begin=False)["models"][0]["error"] is not None
+        assert recording.details()["jumps"]
+
+
 def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, model_file):
     path = read_recording(sample_recording).path(20)
     png = cv2.imdecode(np.frombuffer(attend.picture(path.read_bytes(), str(model_file)), np.uint8), -1)

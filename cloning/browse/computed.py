@@ -35,20 +35,20 @@ def _read_once(folder: Path, version: str) -> Recording:
         return read_uncut(folder)
 
 
-@functools.lru_cache(maxsize=2 * OPEN)  # thousands of cuts take a second, and a page asks every few
+@functools.lru_cache(maxsize=2 * OPEN)  # cuts and tags: thousands take a second, and a page asks every few
 def covered(
     folder: Path, version: str, cuts: tuple[Cut, ...], file: str = EXCLUDED
-) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """Return which rows are in a cut, or with TAGS in a tag, bool (n,), and each cut with its rows.
+) -> tuple[Recording, np.ndarray, list[dict[str, Any]]]:
+    """Return all rows, which of them are in a cut, or with TAGS in a tag, bool (n,), and each cut with its rows.
 
-    Raises RecordingError.
+    A log may grow while it is read: `read` may then give other rows. Raises RecordingError.
     """
     recording, shown = read(folder, version), []
     is_cut = np.zeros(len(recording), bool)
     for cut, rows in zip(cuts, cut_rows(folder, cuts, recording.names, recording.images[:, 0], file), strict=True):
         is_cut |= rows
         shown.append({**cut.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)})
-    return is_cut, shown
+    return recording, is_cut, shown
 
 
 @functools.lru_cache(maxsize=6 * OPEN)  # 100,000 rows take 3 MB
@@ -69,23 +69,22 @@ def line_views(folder: Path, version: str, replay: Analysis, now: str, line: int
 @functools.lru_cache(maxsize=1000)  # a few kB each, so that a list of recordings need not be read again
 def figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any]:
     """Return a recording's figures; see `summary.figures`."""
-    recording = read(folder, version)
-    return summary.figures(recording, covered(folder, version, cuts)[0])
+    return summary.figures(*covered(folder, version, cuts)[:2])
 
 
 @functools.lru_cache(maxsize=1000)
 def road(folder: Path, version: str, cuts: tuple[Cut, ...], now: str) -> dict[str, Any]:
     """Return where a recording was driven; see `summary.road_of`."""
-    recording = read(folder, version)
-    return summary.road_of(result(folder, LANE, now), recording.images[:, 0], covered(folder, version, cuts)[0])
+    recording, is_cut, _ = covered(folder, version, cuts)
+    return summary.road_of(result(folder, LANE, now), recording.images[:, 0], is_cut)
 
 
 @functools.lru_cache(maxsize=1000)
 def error(folder: Path, version: str, cuts: tuple[Cut, ...], analysis: Analysis, now: str) -> float | None:
     """Return the root mean square of the difference of a model's steering from the driver's; None if it is unknown."""
-    recording = read(folder, version)
+    recording, is_cut, _ = covered(folder, version, cuts)
     difference = result(folder, analysis, now).column("steering", recording.images[:, 0]) - recording.steering
-    known = difference[~np.isnan(difference) & ~covered(folder, version, cuts)[0]]
+    known = difference[~np.isnan(difference) & ~is_cut]
     return float(np.sqrt(np.mean(known**2))) if len(known) else None
 
 

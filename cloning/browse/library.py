@@ -138,19 +138,20 @@ class ShownRecording:
         Raises RecordingError, UnknownError.
         """
         version = self.version()
-        recording = self.read(version)
+        recording, kept = self._with_kept(version)
         self.analyses.urgent = self.folder
         models = [{"name": name, **self._state(f"model-{at}")} for at, name in enumerate(self.models)]
         shown = self._without_map()
         if "message" in shown:  # a file has changed since
             raise RecordingError(shown["message"])
         for kind, file in (("cuts", EXCLUDED), ("tags", TAGS)):
-            shown[kind] = computed.covered(self.folder, version, tuple(read_cuts(self.folder, file)), file)[1]
-        offset = self.column("offset") if shown["lane"]["state"] == "ready" else None
-        steering = [self.column(f"model-{at}") for at, model in enumerate(models) if model["state"] == "ready"]
+            shown[kind] = computed.covered(self.folder, version, tuple(read_cuts(self.folder, file)), file)[2]
+        offset = self._found("offset", recording) if shown["lane"]["state"] == "ready" else None
+        ready = [f"model-{at}" for at, model in enumerate(models) if model["state"] == "ready"]
+        steering = [self._found(column, recording) for column in ready]
         return shown | {
             "models": models,
-            "jumps": summary.jumps(recording.steering, offset, steering, ~self._kept(version)),
+            "jumps": summary.jumps(recording.steering, offset, steering, ~kept),
             "limit": limit,
             "replays": [self._replay(version, column) for column in self._replays(limit)] if limit else [],
         }
@@ -199,8 +200,11 @@ class ShownRecording:
             return summary.driven_seconds(recording.time).astype(np.float32)
         if name in COLUMNS:
             return getattr(recording, name)
-        result, _ = self._result(name)
-        return result.column(self.analysed[name][1], recording.images[:, 0])
+        return self._found(name, recording)
+
+    def _found(self, column: str, recording: Recording) -> np.ndarray:
+        """Return a column of an analysis, as `column`."""
+        return self._result(column)[0].column(self.analysed[column][1], recording.images[:, 0])
 
     def matches(self, condition: str, limit: str | None, version: str | None = None) -> dict[str, Any]:
         """Return the rows that meet a condition: their number, and the stretches of them that are not cut.
@@ -209,14 +213,15 @@ class ShownRecording:
         called as on the page: model1, driver1, replay1: the first model's, the last two at a limit. Raises UserError.
         """
         version = self.version() if version is None else version
-        recording = self.read(version)
+        self.read(version)  # or says that it has changed
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}
         for index in range(len(self.models)):
             names[f"model{index + 1}"] = f"model-{index}"
             if limit:
                 names |= {f"{kind}{index + 1}": f"{kind}-{index}-{limit}" for kind in ("replay", "driver")}
         rows = matching(condition, lambda name: self.column(names[name], version), list(names))
-        rows &= self._kept(version)
+        recording, kept = self._with_kept(version)
+        rows &= kept
         found = stretches_of(rows)
         ends = [[first, end, recording.name(first), recording.name(end - 1)] for first, end in found]
         return {"rows": int(rows.sum()), "stretches": ends}
@@ -270,9 +275,10 @@ class ShownRecording:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
 
-    def _kept(self, version: str) -> np.ndarray:
-        """Return the rows that are not cut: bool (n,). Raises RecordingError."""
-        return ~computed.covered(self.folder, version, tuple(read_cuts(self.folder)))[0]
+    def _with_kept(self, version: str) -> tuple[Recording, np.ndarray]:
+        """Return all rows, and which are not cut: bool (n,). Raises RecordingError."""
+        recording, is_cut, _ = computed.covered(self.folder, version, tuple(read_cuts(self.folder)))
+        return recording, ~is_cut
 
     def _with_row(self, row: int, version: str | None) -> Recording:
         recording = self.read(version)
@@ -296,12 +302,13 @@ class ShownRecording:
         stretches: None for all rows.
         """
         version = self.version() if version is None else version
-        recording = self.read(version)
+        self.read(version)  # or says that it has changed
+        recording, kept = self._with_kept(version)
         stretches = [[0, len(recording)]] if stretches is None else stretches
         chosen = np.zeros(len(recording), bool)
         for first, end in stretches:
             chosen[first:end] = True
-        chosen &= self._kept(version)
+        chosen &= kept
         if not chosen.any():
             raise RecordingError(f"{self.folder}: all of the selection is cut; select other frames")
         return recording.take(chosen)
