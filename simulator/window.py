@@ -266,8 +266,10 @@ class Window(ShowBase):
             case "save":
                 self.saved = (run.s, run.offset)
             case "jump":
-                # Never forward: else a lap could end that was not driven.
-                run.travelled -= (run.s - self.saved[0]) % run.track.length
+                # Not forward, else a lap could end that was not driven; nor back further than into the lap before it.
+                length = run.track.length
+                back = run.travelled - (run.s - self.saved[0]) % length
+                run.travelled = max(back, (run.laps - 1) * length + back % length)
                 run.s, run.at_end = self.saved[0], False
                 run.set_back(self.saved[1])
             case "view":

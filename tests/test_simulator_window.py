@@ -313,6 +313,16 @@ def test_a_jump_does_not_count_as_driven(share, saved):
     assert run.travelled == pytest.approx(saved - ahead * run.track.length)
 
 
+def test_however_often_a_jump_leads_ahead_the_next_lap_from_the_start_counts():
+    run = Run(Track("lake"))
+    window: Any = SimpleNamespace(simulation=run, saved=(500.0, 0.0))
+    run.s = run.travelled = 500.0
+    for _ in range(3):
+        run.s, run.travelled = 400.0, run.travelled - 100
+        Window.act(window, "jump")
+    assert run.travelled == pytest.approx(500 - run.track.length), "500 m into the lap before the first"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")
 def test_without_a_screen_it_reports_that(tmp_path):
     elsewhere = {"DISPLAY": ":65535"}  # without the variable, panda3d takes a desktop's screen, :0
