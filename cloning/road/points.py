@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from cloning.base.errors import TrackError
+from cloning.base.outputs import plural
 from cloning.road.generated import LANDS, MARKINGS, PointRoad
 from cloning.road.track import Track
 
@@ -75,7 +76,7 @@ def make_road(
         numbers = numbers[:-1]
     closed = ends_meet if closed is None else bool(closed)
     if len(numbers) < (3 if closed else 2):
-        found = f"{len(numbers)} points that are {SAME_POINT:g} m apart"
+        found = f"{plural(len(numbers), 'point')} at least {SAME_POINT:g} m apart"
         raise TrackError(f"{found}; a road needs 2, and a closed one 3")
     if not isinstance(width, int | float | np.integer | np.floating) or not MIN_WIDTH <= width <= MAX_WIDTH:
         raise TrackError(f"width {width!r}: it must be {MIN_WIDTH:g} to {MAX_WIDTH:g} (m)")
