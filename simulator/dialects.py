@@ -72,7 +72,7 @@ class Dialect(Driven):
 
     def __init__(self, stage: Stage):
         self.stage, self.still, self.ready, self.over, self.episodes = stage, False, True, False, 0
-        self.weather = "sunny"  # as `in_weather` names it, of the tracks that are built from now on
+        self.weather = "sunny"  # as `in_weather` names it
         self.views: list[Cameras] = []
         self.replies: list[str] = []  # packets to send besides telemetry
         self.open(stage.source, stage.direction)
@@ -85,12 +85,17 @@ class Dialect(Driven):
 
     def show(self) -> None:
         """Let the telemetry's images show the track in its weather from now on. Raises TrackError."""
-        self.disturbance, self.seen = self.stage.disturbance or FALLING.get(self.weather), -1.0
+        self.disturbance = self.stage.disturbance or FALLING.get(self.weather)
         for i, built in enumerate(self.build(self.track.source)):
             if i < len(self.views):
                 self.views[i].move(Scene(built))
             else:
                 self.views.append(Cameras(Scene(built), ("center",)))
+        self.begin_frames()
+
+    def begin_frames(self) -> None:
+        """Let the next frame be drawn anew, as the first of a drive."""
+        self.seen = -1.0  # simulated s at the last frame
         self.views[0].disturb(self.disturbance)
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
@@ -99,8 +104,8 @@ class Dialect(Driven):
 
     def restart(self) -> None:
         """Set the car at the start of its road, at rest."""
-        self.run, self.seen = Run(self.track, "autonomous"), -1.0  # simulated s at the last frame
-        self.views[0].disturb(self.disturbance)
+        self.run = Run(self.track, "autonomous")
+        self.begin_frames()
         self.steering = self.throttle = 0.0
 
     def step(self) -> None:

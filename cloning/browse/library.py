@@ -213,14 +213,13 @@ class ShownRecording:
         called as on the page: model1, driver1, replay1: the first model's, the last two at a limit. Raises UserError.
         """
         version = self.version() if version is None else version
-        self.read(version)  # or says that it has changed
+        recording, kept = self._with_kept(version)
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}
         for index in range(len(self.models)):
             names[f"model{index + 1}"] = f"model-{index}"
             if limit:
                 names |= {f"{kind}{index + 1}": f"{kind}-{index}-{limit}" for kind in ("replay", "driver")}
         rows = matching(condition, lambda name: self.column(names[name], version), list(names))
-        recording, kept = self._with_kept(version)
         rows &= kept
         found = stretches_of(rows)
         ends = [[first, end, recording.name(first), recording.name(end - 1)] for first, end in found]
@@ -275,8 +274,10 @@ class ShownRecording:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
 
-    def _with_kept(self, version: str) -> tuple[Recording, np.ndarray]:
-        """Return all rows, and which are not cut: bool (n,). Raises RecordingError."""
+    def _with_kept(self, version: str | None) -> tuple[Recording, np.ndarray]:
+        """Return all rows, and which are not cut: bool (n,). Raises RecordingError as `read`."""
+        version = self.version() if version is None else version
+        self.read(version)
         recording, is_cut, _ = computed.covered(self.folder, version, tuple(read_cuts(self.folder)))
         return recording, ~is_cut
 
@@ -301,8 +302,6 @@ class ShownRecording:
 
         stretches: None for all rows.
         """
-        version = self.version() if version is None else version
-        self.read(version)  # or says that it has changed
         recording, kept = self._with_kept(version)
         stretches = [[0, len(recording)]] if stretches is None else stretches
         chosen = np.zeros(len(recording), bool)

@@ -19,8 +19,8 @@ from cloning.recordings.saved_frames import DRIVEN, DRIVEN_COLUMNS, taken_at
 
 MANIFEST = "manifest.json"
 FRAME_SECONDS = 0.05  # donkeycar's usual 20 rows a second, for tubs without times
-# As donkeycar's templates name them: what a person steers; what the template of computer vision does
-ANGLE_AND_THROTTLE = (("user/angle", "user/throttle"), ("steering", "throttle"))
+# Names of steering and throttle, of a person and of donkeycar's template of computer vision
+PERSON, TEMPLATE = ("user/angle", "user/throttle"), ("steering", "throttle")
 NUMBER = r",(-?\d+\.?\d*(?:e-\d+)?)"
 # At the end of a line, which begins with a part of another row if the disk was full in the middle of that.
 ROW = re.compile(rf"(\d{{4}}(?:_\d\d){{5}}_\d{{3}}\.jpg){NUMBER * 3}\n", re.ASCII)
@@ -56,7 +56,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
                     notes["a row whose image is missing or damaged is left out"] += 1
                 else:
                     time = row["_timestamp_ms"] / 1000 if "_timestamp_ms" in row else index * FRAME_SECONDS
-                    angle, throttle = ANGLE_AND_THROTTLE["user/angle" not in row and "steering" in row]
+                    angle, throttle = TEMPLATE if "steering" in row and "user/angle" not in row else PERSON
                     more = {"throttle": float(row[throttle])} if throttle in row else {}
                     yield Sample(time, [image], {"steering": float(row[angle]), **more})
             except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:

@@ -56,8 +56,9 @@ def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str,
     for key, each in info["features"].items():
         count = min(each["shape"][0], MOST_NUMBERS) if len(each["shape"]) == 1 else 0
         names = each.get("names") or ([key.rpartition(".")[2]] if count == 1 else [str(at) for at in range(count)])
-        while isinstance(names, dict) or isinstance(next(iter(names), None), list):  # {"motors": [...]}, or [[...]],
-            first = next(iter(names.values())) if isinstance(names, dict) else names[0]  # or each name with its place
+        # Also {"motors": [...]}, [[...]], or each name with its place
+        while isinstance(names, dict) or isinstance(next(iter(names), None), list):
+            first = next(iter(names.values())) if isinstance(names, dict) else names[0]
             names = sorted(names, key=names.__getitem__) if isinstance(first, int) else first
         for at, name in enumerate(names if count else []):
             places[f"{key}:{name}"] = key, at
