@@ -30,7 +30,6 @@ class Kind(NamedTuple):
     # a drive; frame: random numbers of one frame.
     change: Callable[[np.ndarray, float, int, Generator], np.ndarray]
     strengths: tuple[float, float, float, float, float]  # the parameter of each strength
-    caption: str  # what the parameter is
 
 
 def _drive(seed: int) -> Generator:
@@ -257,28 +256,28 @@ def _as_it_is(image: np.ndarray, parameter: float, seed: int, frame: Generator) 
 
 
 KINDS = {
-    "rain": Kind(rain, (0.003, 0.006, 0.012, 0.022, 0.04), "share of pixels hit by a drop"),
-    "fog": Kind(fog, (0.4, 0.55, 0.7, 0.8, 0.88), "share of the light that is the fog's"),
-    "snow": Kind(snow, (0.005, 0.012, 0.025, 0.05, 0.1), "share of pixels hit by a flake"),
-    "night": Kind(night, (0.5, 0.35, 0.22, 0.13, 0.08), "share of the light that is left"),
-    "sun": Kind(sun, (0.5, 0.8, 1.2, 1.8, 2.8), "light of the glare's middle, white is 1"),
-    "dirt": Kind(dirt, (0.06, 0.12, 0.22, 0.35, 0.5), "share of the lens that is covered"),
-    "drops": Kind(drops, (8, 18, 35, 60, 100), "drops on the lens"),
-    "motion_blur": Kind(motion_blur, (5, 9, 15, 23, 35), "length, pixels"),
-    "defocus": Kind(defocus, (2, 4, 6, 8, 11), "radius, pixels"),
-    "noise": Kind(noise, (0.08, 0.12, 0.22, 0.32, 0.45), "standard deviation, white is 1"),
-    "contrast": Kind(contrast, (0.4, 0.3, 0.2, 0.1, 0.05), "share of the contrast that is left"),
-    "overexposed": Kind(exposed, (1.3, 1.6, 2, 3, 4.5), "factor of the light"),
-    "underexposed": Kind(exposed, (0.6, 0.4, 0.25, 0.14, 0.07), "factor of the light"),
-    "colour": Kind(colour, (20, 40, 70, 110, 170), "turn of the hue, degrees"),
-    "jpeg": Kind(jpeg, (30, 18, 15, 8, 3), "quality"),
-    "pixelated": Kind(pixelated, (0.6, 0.5, 0.4, 0.25, 0.13), "scale"),
-    "occluded": Kind(occluded, (0.06, 0.12, 0.2, 0.32, 0.45), "share of the view that boxes cover without overlap"),
-    "shifted": Kind(shifted, (4, 8, 14, 20, 28), "pixels, in any direction"),
-    "turned": Kind(turned, (2, 5, 9, 14, 20), "degrees"),
-    "shaken": Kind(shaken, (1.5, 3, 6, 9, 14), "standard deviation, pixels"),
-    "dropped": Kind(_as_it_is, (0.2, 0.4, 0.6, 0.75, 0.88), "share of the frames that are lost: the last one stays"),
-    "late": Kind(_as_it_is, (1, 2, 3, 4, 6), "frames late, 15 a second"),
+    "rain": Kind(rain, (0.003, 0.006, 0.012, 0.022, 0.04)),  # share of pixels hit by a drop
+    "fog": Kind(fog, (0.4, 0.55, 0.7, 0.8, 0.88)),  # share of the light that is the fog's
+    "snow": Kind(snow, (0.005, 0.012, 0.025, 0.05, 0.1)),  # share of pixels hit by a flake
+    "night": Kind(night, (0.5, 0.35, 0.22, 0.13, 0.08)),  # share of the light that is left
+    "sun": Kind(sun, (0.5, 0.8, 1.2, 1.8, 2.8)),  # light of the glare's middle, white is 1
+    "dirt": Kind(dirt, (0.06, 0.12, 0.22, 0.35, 0.5)),  # share of the lens that is covered
+    "drops": Kind(drops, (8, 18, 35, 60, 100)),  # drops on the lens
+    "motion_blur": Kind(motion_blur, (5, 9, 15, 23, 35)),  # length, pixels
+    "defocus": Kind(defocus, (2, 4, 6, 8, 11)),  # radius, pixels
+    "noise": Kind(noise, (0.08, 0.12, 0.22, 0.32, 0.45)),  # standard deviation, white is 1
+    "contrast": Kind(contrast, (0.4, 0.3, 0.2, 0.1, 0.05)),  # share of the contrast that is left
+    "overexposed": Kind(exposed, (1.3, 1.6, 2, 3, 4.5)),  # factor of the light
+    "underexposed": Kind(exposed, (0.6, 0.4, 0.25, 0.14, 0.07)),  # factor of the light
+    "colour": Kind(colour, (20, 40, 70, 110, 170)),  # turn of the hue, degrees
+    "jpeg": Kind(jpeg, (30, 18, 15, 8, 3)),  # quality
+    "pixelated": Kind(pixelated, (0.6, 0.5, 0.4, 0.25, 0.13)),  # scale
+    "occluded": Kind(occluded, (0.06, 0.12, 0.2, 0.32, 0.45)),  # share of the view that boxes cover without overlap
+    "shifted": Kind(shifted, (4, 8, 14, 20, 28)),  # pixels, in any direction
+    "turned": Kind(turned, (2, 5, 9, 14, 20)),  # degrees
+    "shaken": Kind(shaken, (1.5, 3, 6, 9, 14)),  # standard deviation, pixels
+    "dropped": Kind(_as_it_is, (0.2, 0.4, 0.6, 0.75, 0.88)),  # share of the frames that are lost: the last one stays
+    "late": Kind(_as_it_is, (1, 2, 3, 4, 6)),  # frames late, 15 a second
 }
 # A third of the kinds: no network of the project is trained on them, so that they tell how far its skill carries.
 HELD_OUT = ("snow", "drops", "motion_blur", "overexposed", "jpeg", "dropped", "late")
@@ -303,7 +302,7 @@ class Disturbance(NamedTuple):
 
     @property
     def parameter(self) -> float:
-        """What the strength means for this kind: see its caption."""
+        """What the strength means for this kind: see `KINDS`."""
         return KINDS[self.kind].strengths[self.strength - 1]
 
 
