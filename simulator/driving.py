@@ -2,9 +2,9 @@
 
 An ONNX file whose network does not take the simulator's frames as they are needs a file beside it, of the same name
 with the ending .json, such as `{"crop": [60, 25, 0, 0], "colour": "YUV", "range": [-1, 1]}`: the rows and columns that
-are cut off at the top, the bottom, the left and the right, the colour space, and what 0 and 255 become. Without it, or
-without one of them, frames are not cut, are RGB, and are not scaled. After the cut a frame gets the height and width
-that the file's input has.
+are cut off at the top, the bottom, the left and the right, the colour space, and what 0 and 255 become, a number each
+or one for each colour. Without it, or without one of them, frames are not cut, are RGB, and are not scaled. After the
+cut a frame gets the height and width that the file's input has.
 """
 
 import functools
@@ -52,8 +52,15 @@ from simulator.world import Scene
 
 PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set speed
 WAIT = 60.0  # s for a server's answer
+MOST = 3  # numbers in an ONNX network's answer, of which the steering is the first: throttle and brake may follow
 BUILT_IN = ("straight", "expert")  # drivers that need no camera: steering 0, and the one that drives recordings
-COLOURS = {"RGB": None, "BGR": cv2.COLOR_RGB2BGR, "YUV": cv2.COLOR_RGB2YUV, "HSV": cv2.COLOR_RGB2HSV}
+COLOURS = {
+    "RGB": None,
+    "BGR": cv2.COLOR_RGB2BGR,
+    "YUV": cv2.COLOR_RGB2YUV,
+    "HSV": cv2.COLOR_RGB2HSV,
+    "GRAY": cv2.COLOR_RGB2GRAY,
+}
 PREPROCESSING = {"crop": [0, 0, 0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
 _ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
 _cameras: list[Cameras] = []  # this process's, which move from road to road: new ones for each would add up
@@ -137,20 +144,24 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
     options.intra_op_num_threads = 1
     try:
         session = onnxruntime.InferenceSession(driver, options)
-        taken = session.get_inputs()[0]
+        if len(inputs := session.get_inputs()) != 1:
+            raise ValueError(f"its inputs are {', '.join(each.name for each in inputs) or 'none'}, not one image")
+        taken = inputs[0]
         prepare = preprocessing(Path(driver).with_suffix(".json"), taken.shape, taken.type == "tensor(uint8)")
 
         def steering(frame: np.ndarray) -> float:
-            found = session.run(None, {taken.name: prepare(frame)})[0].flat[0]
-            if not np.isfinite(found):
+            found = np.ravel(session.run(None, {taken.name: prepare(frame)})[0])
+            if not 1 <= len(found) <= MOST:
+                raise ValueError(f"its first output has {len(found)} numbers, not the steering")
+            if not np.isfinite(found[0]):
                 raise ArithmeticError("the network's steering is not finite")
-            return float(np.clip(found, -1, 1))
+            return float(np.clip(found[0], -1, 1))
 
         steering(np.resize(np.arange(256, dtype=np.uint8), FRAME))  # some divide by the deviation of a frame
     except UserError:
         raise
     except Exception as error:  # onnxruntime has its own, without a common class
-        reason = " ".join(str(error)[:200].split())
+        reason = " ".join(str(error).split())[-300:]  # which onnxruntime tells last
         raise UserError(f"{driver}: does not steer by a frame as LEADERBOARD.md says: {reason}") from None
     return steering
 
@@ -172,32 +183,39 @@ def _load_limits_of(driver: str, *digests: str) -> tuple[Observer, Limits] | Non
 def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes an ONNX network's input of a frame; file: see above, may be missing.
 
-    shape: of the input, (n, rows, columns, 3) or (n, 3, rows, columns); texts or None for sizes that are free; whole:
-    it takes uint8, else float32. Raises UserError.
+    shape: of the input, (n, rows, columns, 3) or (n, 3, rows, columns), with 1 in place of 3 for gray ones; texts or
+    None for sizes that are free; whole: it takes uint8, else float32. Raises UserError, ValueError if it is no image.
     """
     try:
         said = json.loads(file.read_text(encoding="utf-8-sig")) if file.exists() else {}
-        crop, colour, (low, high) = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
+        crop, colour, ends = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
+        if unknown := set(said) - set(PREPROCESSING):
+            raise ValueError(f"it has {', '.join(sorted(unknown))}")
         top, bottom, left, right = map(index, crop if len(crop) == 4 else (*crop, 0, 0))  # rows alone are enough
-        conversion, scale = COLOURS[colour], (high - low) / 255
-        last = shape[-1] == 3
-        rows, columns = shape[1:3] if last else shape[2:]
-        size = (columns, rows) if type(rows) is type(columns) is int else None
-        unknown = set(said) - set(PREPROCESSING)
-        whole_cut = not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1])
-        scaled = whole and [low, high] != PREPROCESSING["range"]  # which bytes can't be
-        if unknown or whole_cut or scaled or len(shape) != 4 or 3 not in (shape[1], shape[3]):
-            raise ValueError(f"shape {shape}, {said}")
+        if not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1]):
+            raise ValueError(f"a frame has {FRAME[0]} rows and {FRAME[1]} columns")
+        conversion, channels = COLOURS[colour], 1 if colour == "GRAY" else 3
+        low, high = (np.broadcast_to(np.multiply(end, 1.0), channels) for end in ends)
+        if whole and ends != PREPROCESSING["range"]:
+            raise ValueError("the network takes uint8, whose range is 0 to 255")
     except (ValueError, TypeError, LookupError, OSError) as error:
         wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
         raise UserError(f"{file}: does not tell how frames become the network's input ({error!r}); {wanted}") from None
+    if len(shape) != 4 or channels not in (shape[1], shape[3]):
+        wanted = f"(1, rows, columns, {channels}) or (1, {channels}, rows, columns), as for {colour}"
+        raise ValueError(f"its input is {shape}, not {wanted}")
+    last = shape[-1] == channels
+    rows, columns = shape[1:3] if last else shape[2:]
+    size = (columns, rows) if type(rows) is type(columns) is int else None
+    scale = (high - low) / 255
 
     def prepare(frame: np.ndarray) -> np.ndarray:
         image = frame[top : FRAME[0] - bottom, left : FRAME[1] - right]
         image = cv2.resize(image, size) if size and size != (image.shape[1], image.shape[0]) else image
         image = image if conversion is None else cv2.cvtColor(np.ascontiguousarray(image), conversion)
-        image = image if last else image.transpose(2, 0, 1)
-        return np.ascontiguousarray(image if whole else (image * scale + low).astype(np.float32))[None]
+        image = image.reshape(*image.shape[:2], channels)
+        image = image if whole else (image * scale + low).astype(np.float32)
+        return np.ascontiguousarray(image if last else image.transpose(2, 0, 1))[None]
 
     return prepare
 

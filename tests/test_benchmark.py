@@ -147,17 +147,18 @@ def test_a_server_is_told_the_time_and_no_place_and_its_speed_is_held_for_it():
     assert times[0] == 0 and times[-1] == pytest.approx(done.seconds, abs=0.1) and not sent[-1]["stand_in"]
 
 
-def onnx_file(path, shape, axes, kind, reduced="ReduceMean"):
-    """A network that steers by the mean over these axes of its input, of which it returns the first number."""
+def onnx_file(path, shape, axes, kind, reduced="ReduceMean", more=()):
+    """A network that steers by the mean over these axes of its input; more: names of inputs that it leaves unused."""
     from onnx import TensorProto, helper, save
 
     nodes = [
         helper.make_node("Cast", ["frames"], ["numbers"], to=TensorProto.FLOAT),
         helper.make_node(reduced, ["numbers"], ["steering"], axes=axes, keepdims=0),
     ]
-    taken = helper.make_tensor_value_info("frames", kind, shape)
+    taken = [helper.make_tensor_value_info("frames", kind, shape)]
+    taken += [helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 1)) for name in more]
     given = helper.make_tensor_value_info("steering", TensorProto.FLOAT, None)
-    graph = helper.make_graph(nodes, "mean", [taken], [given])
+    graph = helper.make_graph(nodes, "mean", taken, [given])
     save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
     return str(path)
 
@@ -215,26 +216,73 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
     assert driving.load_driver(file)(frame) == pytest.approx(2 * 0.299 - 1, abs=0.005)
     digest = driving.digest_of(tmp_path / "keras.onnx")
     crops = (f'{{"crop": {crop}}}' for crop in ([100, 60], [0, 0, 320, 0], [1, 2, 3], [1.5, 0]))
-    for wrong in (*crops, '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):
+    ranges = (f'{{"range": {ends}}}' for ends in ([0], [0, [1, 2]], ["0", "1"]))
+    for wrong in (*crops, *ranges, '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):
         (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
         with pytest.raises(UserError, match=r"keras\.json: does not tell"):
             driving.load_driver(file)
         assert driving.digest_of(tmp_path / "keras.onnx") != digest, "earlier results are another entry's"
 
 
+@pytest.mark.parametrize(("shape", "axes"), [((1, 66, 200, 1), [1, 2]), ((None, 1, 66, 200), [2, 3])])
+def test_an_onnx_network_may_see_gray_images(tmp_path, shape, axes):
+    """Gray is Y of YUV."""
+    file = onnx_file(tmp_path / "gray.onnx", shape, axes, kind=1)
+    (tmp_path / "gray.json").write_text('{"colour": "GRAY", "range": [0, 1]}', encoding="utf-8")
+    red = np.full((160, 320, 3), (255, 0, 0), np.uint8)
+    assert driving.load_driver(file)(red) == pytest.approx(0.299, abs=0.005)
+
+
+@pytest.mark.parametrize("shape", [(1, 8, 9, 3), (1, 3, 8, 9)])
+def test_each_colour_may_have_a_range_of_its_own(tmp_path, shape):
+    """As of torchvision's Normalize, with the means and deviations of ImageNet."""
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    ends = [list((each - mean) / deviation) for each in (0, 1)]
+    (tmp_path / "own.json").write_text(json.dumps({"range": ends}), encoding="utf-8")
+    prepare = driving.preprocessing(tmp_path / "own.json", list(shape), whole=False)
+    prepared = prepare(np.full((160, 320, 3), (51, 102, 153), np.uint8))
+    expected = (np.array([0.2, 0.4, 0.6]) - mean) / deviation
+    assert prepared.shape == shape and prepared.dtype == np.float32
+    np.testing.assert_allclose(np.moveaxis(prepared, shape.index(3), -1), np.tile(expected, (1, 8, 9, 1)), rtol=1e-6)
+
+
 @pytest.mark.parametrize(
-    ("shape", "axes", "kind", "reason"),
+    ("shape", "axes", "kind", "more", "reason"),
     [
-        ((1, 160, 320, 3), [1, 2], 11, "expected: (tensor(double))"),
-        ((2, 160, 320, 3), [1, 2], 1, "invalid dimensions"),
-        ((), None, 1, "does not tell how frames become"),
+        ((1, 160, 320, 3), [1, 2], 11, (), "expected: (tensor(double))"),
+        ((2, 160, 320, 3), [1, 2], 1, (), "Got: 1 Expected: 2"),
+        ((), None, 1, (), "its input is []"),
+        ((1, 5, 66, 200, 3), [1, 2, 3], 1, (), "its input is [1, 5, 66, 200, 3]"),
+        ((1, 66, 200, 1), [1, 2], 1, (), "not (1, rows, columns, 3) or (1, 3, rows, columns), as for RGB"),
+        ((1, 66, 200, 3), [1, 2], 1, ("speed",), "its inputs are frames, speed"),
+        ((1, 15, 200, 3), [2, 3], 1, (), "its first output has 15 numbers"),
     ],
 )
-def test_an_onnx_network_of_other_inputs_is_refused_before_it_drives(tmp_path, shape, axes, kind, reason):
-    file = onnx_file(tmp_path / "other.onnx", shape, axes, kind)
-    with pytest.raises(UserError, match=r"other\.") as caught:
+def test_an_onnx_network_of_another_kind_is_refused_before_it_drives(tmp_path, shape, axes, kind, more, reason):
+    file = onnx_file(tmp_path / "other.onnx", shape, axes, kind, more=more)
+    with pytest.raises(UserError, match=r"other\.onnx: does not steer by a frame as LEADERBOARD\.md says") as caught:
         driving.load_driver(file)
     assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_is_wrong_with_an_onnx_entry_is_told_shortly_and_to_the_end(tmp_path):
+    import onnx
+
+    file = onnx_file(tmp_path / "model.onnx", (1, 66, 200, 3), [1, 2], kind=1)
+    about = {"class_name": "Sequential", "config": {"layers": ["Conv2D"] * 100}}  # Keras' file about a network
+    (tmp_path / "model.json").write_text(json.dumps(about), encoding="utf-8")
+    with pytest.raises(UserError, match="it has class_name, config") as caught:
+        driving.load_driver(file)
+    assert "Conv2D" not in str(caught.value)
+    (tmp_path / "model.json").write_text('{"crop": [100, 60]}', encoding="utf-8")
+    with pytest.raises(UserError, match="a frame has 160 rows and 320 columns"):
+        driving.load_driver(file)
+    (tmp_path / "model.json").unlink()
+    model = onnx.load(file)
+    model.ir_version = 99
+    onnx.save(model, file)
+    with pytest.raises(UserError, match="Unsupported model IR version: 99, max supported IR version"):
+        driving.load_driver(file)
 
 
 def test_a_model_that_is_trained_anew_drives_with_its_new_weights(network, tmp_path):
