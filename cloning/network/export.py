@@ -5,7 +5,7 @@
 
 The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends them, and returns `steering`, float32 (n,),
 -1..1, positive to the right; values outside must be clipped, as drive.py does. Cropping, brightening and scaling are
-part of it.
+part of it. ONNX Runtime 1.14 (2023) or later runs it, and so does OpenCV (tried: 4.14 and 5.0).
 """
 
 from cloning.base import program
@@ -30,7 +30,7 @@ from cloning.base.outputs import check_folders
 from cloning.network.compute import one_thread
 from cloning.network.network import Network, load_model
 
-OPSET = 20  # of ONNX's operators; ONNX Runtime knows it since 1.17 (2024)
+OPSET, IR = 18, 8  # of ONNX's operators and of its files: both are of ONNX 1.13
 TOLERANCE = 1e-5  # of the steering
 
 
@@ -70,6 +70,7 @@ def onnx_program(network: nn.Module, images: torch.Tensor, **options: Any) -> to
         warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
         exported = torch.onnx.export(network, (images,), dynamo=True, opset_version=OPSET, verbose=False, **options)
     assert exported, "torch returns the program with dynamo=True"
+    exported.model.ir_version = IR
     for node in exported.model.graph.all_nodes():
         node.metadata_props.clear()
     return exported
