@@ -293,9 +293,8 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
     if argument is None:
         return usual
     if kind := FOREIGN.get(argument.suffix):
-        raise UserError(
-            f"{argument}: a model of {kind}, which PyTorch can't read; `python model.py` trains one that drives"
-        )
+        remedy = "`python model.py` trains one that drives; LEADERBOARD.md tells how others can"
+        raise UserError(f"{argument}: a model of {kind}, which PyTorch can't read; {remedy}")
     if folder is None and not argument.is_file() and argument.suffix not in (".pt", ".pth"):
         command = as_typed("python", "drive.py", usual, argument)
         raise UserError(

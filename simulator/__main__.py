@@ -95,7 +95,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
     add = command(run_replay, text, server, wait, disturb).add_argument
     add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
-    add("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
+    add("--model", metavar="model.pt", help="drive with this model, or .onnx file, in this process, without drive.py")
     text = (
         "distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
         "(default 1, as in NVIDIA's evaluation, and 2.5, where on the lake the side of the car is on the edge line)"
@@ -262,7 +262,12 @@ def run_replay(arguments: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
     from cloning.replay import command
 
-    command.run(arguments)
+    driver = None
+    if arguments.model and arguments.model.endswith(".onnx"):
+        from simulator.benchmark.replays import driver_of
+
+        driver = driver_of(arguments.model)
+    command.run(arguments, driver)
     return program.DONE
 
 

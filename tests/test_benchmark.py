@@ -285,6 +285,12 @@ def test_what_is_wrong_with_an_onnx_entry_is_told_shortly_and_to_the_end(tmp_pat
         driving.load_driver(file)
 
 
+def test_a_network_of_another_program_is_told_how_it_can_drive(tmp_path):
+    (tmp_path / "model.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(UserError, match=r"model\.h5: not a model of this project.*; LEADERBOARD\.md tells how others"):
+        driving.load_driver(str(tmp_path / "model.h5"))
+
+
 def test_a_model_that_is_trained_anew_drives_with_its_new_weights(network, tmp_path):
     file, frame, steered = tmp_path / "model.pt", np.full((160, 320, 3), 90, np.uint8), list[float]()
     changed = copy.deepcopy(network)

@@ -1,5 +1,6 @@
 """An exported model steers like the model file, also in a program that has no PyTorch."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,8 +13,10 @@ import torch
 from commands import HERE, ROOT, python
 from real_recordings import FOLDERS, MISSING
 
+from cloning.base.program import DONE
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.images import read_frame
+from simulator.__main__ import main
 from simulator.driving import load_driver
 
 
@@ -49,6 +52,16 @@ def test_the_exported_file_steers_like_the_model(exported, sample_recording, rea
     assert steering.dtype == np.float32 and np.ptp(expected) > 0.1
     np.testing.assert_allclose(steering, expected, atol=1e-5)
     assert load_driver(str(exported))(frames[0]) == pytest.approx(np.clip(expected[0], -1, 1), abs=1e-5)
+
+
+def test_an_onnx_file_drives_recordings_as_the_model_does(exported, sample_recording, tmp_path):
+    figures = []
+    for model in (SHIPPED_MODEL, exported):
+        report = tmp_path / "report.json"
+        assert main(["replay", str(sample_recording), "--model", str(model), "--report", str(report)]) == DONE
+        limits = json.loads(report.read_text(encoding="utf-8"))[0]["limits"]
+        figures.append([each["distance_mean_m"] for each in limits.values()])
+    assert len(figures[0]) == 2 and figures[1] == pytest.approx(figures[0], abs=0.01)
 
 
 def test_what_is_missing_is_told_and_nothing_is_written(tmp_path):

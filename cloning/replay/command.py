@@ -36,25 +36,24 @@ from cloning.road.disturbances import Disturbance
 CAN_FORK = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, driver: Driver | None = None) -> None:
     """Replay the recordings at each limit, print their reports and write the files. Raises UserError.
 
     Those of which nothing can be replayed are named and left out, unless that is true of all.
-    options: those of the command, under their names. After an error or Ctrl-C, the files are still written, with the
-    recordings replayed until then.
+    options: those of the command, under their names; driver: what drives in place of their model. After an error or
+    Ctrl-C, the files are still written, with the recordings replayed until then.
     """
     folders = find_folders(options.folders)
     read = [options.model, *(folder / DRIVING_LOG for folder in folders)]
     check_folders(options.report, options.picture, options.film, read=read)
-    driver: Driver
     ending: list[Callable[[], object]] = []
-    if options.model:  # each driver needs a library of its own, PyTorch or wsproto
+    if options.model and not driver:  # each driver needs a library of its own, PyTorch or wsproto
         from cloning.network.compute import one_thread
         from cloning.replay.model_driver import ModelDriver
 
         one_thread()  # other drives run at the same time
         driver = ModelDriver(options.model)
-    else:
+    elif not driver:
         from cloning.replay.server_driver import ServerDriver
 
         driver = server = ServerDriver(options.host, options.port, options.wait)
