@@ -1,10 +1,11 @@
 """How a driver drives a road: a model file, an ONNX file or a server, as `simulator drive` does it, or one built in.
 
 An ONNX file whose network does not take the simulator's frames as they are needs a file beside it, of the same name
-with the ending .json, such as `{"crop": [60, 25, 0, 0], "colour": "YUV", "range": [-1, 1]}`: the rows and columns that
-are cut off at the top, the bottom, the left and the right, the colour space, and what 0 and 255 become, a number each
-or one for each colour. Without it, or without one of them, frames are not cut, are RGB, and are not scaled. After the
-cut a frame gets the height and width that the file's input has.
+with the ending .json, such as `{"crop": [60, 25, 0, 0], "blur": 3, "colour": "YUV", "range": [-1, 1]}`: the rows and
+columns that are cut off at the top, the bottom, the left and the right, the side of a Gaussian blur in pixels, the
+colour space, and what 0 and 255 become, a number each or one for each colour. Without it, or without one of them,
+frames are not cut, not blurred, are RGB, and are not scaled. After the cut and the blur a frame gets the height and
+width that the file's input has.
 """
 
 import functools
@@ -61,7 +62,7 @@ COLOURS = {
     "HSV": cv2.COLOR_RGB2HSV,
     "GRAY": cv2.COLOR_RGB2GRAY,
 }
-PREPROCESSING = {"crop": [0, 0, 0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
+NO_CHANGE = {"crop": [0, 0, 0, 0], "blur": 1, "colour": "RGB", "range": [0, 255]}  # for an ONNX file that says nothing
 _ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
 _cameras: list[Cameras] = []  # this process's, which move from road to road: new ones for each would add up
 Steering = Callable[[np.ndarray], float]  # -1..1, from a frame, uint8 (160, 320, 3), RGB
@@ -191,18 +192,20 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
     """
     try:
         said = json.loads(file.read_text(encoding="utf-8-sig")) if file.exists() else {}
-        crop, colour, ends = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
-        if unknown := set(said) - set(PREPROCESSING):
+        crop, blur, colour, ends = ({**NO_CHANGE, **said}[name] for name in NO_CHANGE)
+        if unknown := set(said) - set(NO_CHANGE):
             raise ValueError(f"it has {', '.join(sorted(unknown))}")
         top, bottom, left, right = map(index, crop if len(crop) == 4 else (*crop, 0, 0))  # rows alone are enough
         if not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1]):
             raise ValueError(f"a frame has {FRAME[0]} rows and {FRAME[1]} columns")
+        if (side := index(blur)) < 1 or side % 2 == 0:
+            raise ValueError("a blur has an odd number of pixels")
         conversion, channels = COLOURS[colour], 1 if colour == "GRAY" else 3
         low, high = (np.broadcast_to(np.multiply(end, 1.0), channels) for end in ends)
-        if whole and ends != PREPROCESSING["range"]:
+        if whole and ends != NO_CHANGE["range"]:
             raise ValueError("the network takes uint8, whose range is 0 to 255")
     except (ValueError, TypeError, LookupError, OSError) as error:
-        wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
+        wanted = f"it may have {json.dumps(NO_CHANGE)} with other values, and colours {', '.join(COLOURS)}"
         raise UserError(f"{file}: does not tell how frames become the network's input ({error!r}); {wanted}") from None
     if len(shape) != 4 or channels not in (shape[1], shape[3]):
         wanted = f"(1, rows, columns, {channels}) or (1, {channels}, rows, columns), as for {colour}"
@@ -213,9 +216,10 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
     scale = (high - low) / 255
 
     def prepare(frame: np.ndarray) -> np.ndarray:
-        image = frame[top : FRAME[0] - bottom, left : FRAME[1] - right]
+        image = np.ascontiguousarray(frame[top : FRAME[0] - bottom, left : FRAME[1] - right])
+        image = cv2.GaussianBlur(image, (side, side), 0)
         image = cv2.resize(image, size) if size and size != (image.shape[1], image.shape[0]) else image
-        image = image if conversion is None else cv2.cvtColor(np.ascontiguousarray(image), conversion)
+        image = image if conversion is None else cv2.cvtColor(image, conversion)
         image = image.reshape(*image.shape[:2], channels)
         image = image if whole else (image * scale + low).astype(np.float32)
         return np.ascontiguousarray(image if last else image.transpose(2, 0, 1))[None]
