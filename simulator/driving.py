@@ -150,13 +150,14 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
         session = onnxruntime.InferenceSession(driver, options)
         if len(inputs := session.get_inputs()) != 1:
             raise ValueError(f"its inputs are {', '.join(each.name for each in inputs) or 'none'}, not one image")
-        taken = inputs[0]
+        taken, given = inputs[0], [each.name for each in session.get_outputs()]
+        answer = next((name for name in given if re.search("steer|angle", name.lower())), given[0])
         prepare = preprocessing(Path(driver).with_suffix(".json"), taken.shape, taken.type == "tensor(uint8)")
 
         def steering(frame: np.ndarray) -> float:
-            found = np.ravel(session.run(None, {taken.name: prepare(frame)})[0])
+            found = np.ravel(session.run([answer], {taken.name: prepare(frame)})[0])
             if not 1 <= len(found) <= MOST:
-                raise ValueError(f"its first output has {len(found)} numbers, not the steering")
+                raise ValueError(f"its output {answer} has {len(found)} numbers, not the steering")
             if not np.isfinite(found[0]):
                 raise ArithmeticError("the network's steering is not finite")
             return float(np.clip(found[0], -1, 1))

@@ -95,6 +95,28 @@ def test_each_colour_may_have_a_range_of_its_own(tmp_path, shape):
 
 
 @pytest.mark.parametrize(
+    ("names", "steers"),
+    [
+        (("speed", "steering"), 1),  # as tf2onnx sorts those of a saved model
+        (("throttle", "brake", "Steer:0"), 2),
+        (("angle_out", "throttle_out"), 0),  # donkeycar's
+        (("n_outputs0", "n_outputs1"), 0),
+    ],
+)
+def test_of_several_outputs_the_steering_is_known_by_its_name(tmp_path, names, steers):
+    import onnx
+
+    model = onnx.load(onnx_file(tmp_path / "own.onnx", (1, 160, 320, 3), [1, 2, 3], kind=1))
+    del model.graph.node[:], model.graph.output[:]
+    for n, name in enumerate(names):
+        constant = onnx.helper.make_tensor("value", onnx.TensorProto.FLOAT, (1, 1), [n / 4])
+        model.graph.node.append(onnx.helper.make_node("Constant", [], [name], value=constant))
+        model.graph.output.append(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, (1, 1)))
+    onnx.save(model, tmp_path / "own.onnx")
+    assert driving.load_driver(str(tmp_path / "own.onnx"))(np.zeros((160, 320, 3), np.uint8)) == steers / 4
+
+
+@pytest.mark.parametrize(
     ("shape", "axes", "kind", "more", "reason"),
     [
         ((1, 160, 320, 3), [1, 2], 11, (), "expected: (tensor(double))"),
@@ -103,7 +125,7 @@ def test_each_colour_may_have_a_range_of_its_own(tmp_path, shape):
         ((1, 5, 66, 200, 3), [1, 2, 3], 1, (), "its input is [1, 5, 66, 200, 3]"),
         ((1, 66, 200, 1), [1, 2], 1, (), "not (1, rows, columns, 3) or (1, 3, rows, columns), as for RGB"),
         ((1, 66, 200, 3), [1, 2], 1, ("speed",), "its inputs are frames, speed"),
-        ((1, 15, 200, 3), [2, 3], 1, (), "its first output has 15 numbers"),
+        ((1, 15, 200, 3), [2, 3], 1, (), "its output steering has 15 numbers"),
     ],
 )
 def test_an_onnx_network_of_another_kind_is_refused_before_it_drives(tmp_path, shape, axes, kind, more, reason):
