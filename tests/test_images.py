@@ -387,6 +387,17 @@ def test_a_cache_that_this_version_has_not_written_is_not_believed(checked, dama
     assert f"{cache}: unreadable" in capsys.readouterr().out
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows always knows a home")
+def test_where_no_home_is_known_the_cache_is_a_temporary_one(linked, tmp_path, monkeypatch, capsys):
+    """As in a container that runs as a user without a name."""
+    for name in ("XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert len(check_images(read_recording(linked))) == 60
+    assert list((tmp_path / "behavioral-cloning").glob("*.npz")) and not capsys.readouterr().out
+
+
 def test_no_damage_to_the_cache_makes_a_changed_image_usable(checked):
     folder, cache, image = checked
     image.write_bytes(b"changed")

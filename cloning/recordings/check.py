@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -140,7 +141,10 @@ def cache_file(folder: Path, analysis: str = "") -> Path:
 
     analysis: what looked, as part of the file's name; empty for `check_images`.
     """
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # nobody's: a container may run as a user without a name
+        home = Path(tempfile.gettempdir())
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
     return home / "behavioral-cloning" / f"{name}{analysis}.npz"
 
