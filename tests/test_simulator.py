@@ -18,6 +18,7 @@ from drive_process import awaited
 from scenes import cameras, load
 
 from cloning.base import progress
+from cloning.recordings.log import read_recording
 from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH
 from cloning.road.points import make_road
@@ -335,3 +336,12 @@ def test_an_existing_recording_is_kept(tmp_path, capsys):
         assert main([command, str(folder)]) == 2
         assert "exists already; name another folder" in capsys.readouterr().err
         assert (folder / "driving_log.csv").read_text(encoding="utf-8") == "precious\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a file's name is text")
+def test_a_folder_may_have_a_name_in_any_encoding(tmp_path):
+    """As a zip from another system leaves it, or a shell without a UTF-8 locale."""
+    folder = tmp_path / os.fsdecode(b"\xe9 lake")
+    with RecordingWriter(folder) as recording:
+        recording.add(0, [b"centre", b"left", b"right"], [0, 1, 0, 30], (0, 0))
+    assert len(read_recording(folder)) == 1

@@ -92,7 +92,8 @@ class RecordingWriter:
                 with written_whole(path) as temporary:
                     temporary.write_bytes(image)
             for file, text in ((self.lane, lane_row), (self.log, row)):
-                if file.write(text.encode()) != len(text.encode()):
+                data = text.encode(errors="surrogateescape")  # the folder's name may have any bytes
+                if file.write(data) != len(data):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             with suppress(OSError):  # the first error matters more
