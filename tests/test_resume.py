@@ -17,7 +17,9 @@ from killed import ALL
 from rendered import render_recording
 
 import model
-from cloning.training.stop import Interrupted, StopSignals
+from cloning.training.distributed import Ranks
+from cloning.training.options import Process
+from cloning.training.stop import Interrupted, StopSignals, status_of
 from model import REPORT
 
 
@@ -373,3 +375,18 @@ def test_resume_is_recommended_only_once_the_new_run_has_a_state(
     assert done.returncode in (2, 130)
     assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr
     assert seed_of(begun / "model-resume.pt") == (advice == "--resume")
+
+
+def test_a_gpu_that_fails_is_told_with_the_remedy(tmp_path, capsys):
+    """As an older one does for which PyTorch has no kernels, or one whose machine has slept."""
+    process, more = Process(str(tmp_path / "model.pt")), "\nFor debugging consider …"
+    for kind, error in (
+        (torch.AcceleratorError, "CUDA error: no kernel image is available for execution on the device"),
+        (torch.OutOfMemoryError, "CUDA out of memory."),
+        (NotImplementedError, "The operator 'aten::median' is not currently implemented for the MPS device."),
+    ):
+        assert status_of(Mock(side_effect=kind(error + more)), process, Ranks()) == 2
+        told = capsys.readouterr().err
+        assert told == f"python: {error}; leave the GPU out with --device cpu, and start the run again\n"
+    with pytest.raises(RuntimeError, match="a fault"):
+        status_of(Mock(side_effect=RuntimeError("a fault")), process, Ranks())

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+import torch
+
 from cloning.base import program
 from cloning.base.errors import UserError, message_of
 from cloning.training.distributed import Ranks
@@ -15,6 +17,9 @@ from cloning.training.run_files import RunFiles
 
 # Windows cannot send SIGTERM and has no SIGHUP, and other systems may lack them.
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGHUP", "SIGTERM") if hasattr(signal, name)]
+
+# A GPU that is too old, too small or gone since the machine slept, or for which torch lacks an operator.
+OF_THE_GPU = torch.AcceleratorError, torch.OutOfMemoryError, NotImplementedError
 
 
 class Interrupted(Exception):
@@ -86,6 +91,10 @@ def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     except OSError as error:
         remedy = f"all earlier files are intact. Remove the cause and {files.next_step(before, resume)}"
         status, message = 2, f"{message_of(error)}; {remedy}"
+    except OF_THE_GPU as error:
+        told, _, _ = str(error).partition("\n")
+        remedy = f"leave the GPU out with --device cpu, and {files.next_step(before, resume)}"
+        status, message = 2, f"{told}; {remedy}"
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:
