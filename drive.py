@@ -356,8 +356,8 @@ def main() -> int:
     listener = connections.claim_port(arguments.host, arguments.port, where_taken)
     if arguments.folder:
         server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
-    stopped, port = connections.noted_signals(), listener.getsockname()[1]
-    watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
+    stopped, (host, port) = connections.noted_signals(), listener.getsockname()[:2]
+    watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # a browser is not served under a name
     stand_in = f"in a second terminal its stand-in: `{page.stand_in('drive', watched, str(port))}`"
     simulator = "Now start the simulator, choose a track and AUTONOMOUS MODE,\nor"
     if port != PORT:

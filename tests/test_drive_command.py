@@ -42,6 +42,14 @@ def test_mistakes_are_reported(model_file, tmp_path):
     assert any((tmp_path / "run1").iterdir()), "a server that cannot start deletes nothing"
 
 
+def test_the_page_of_a_host_with_a_name_is_shown_with_its_address(model_file, monkeypatch):
+    """Under a name a browser is refused; the simulators and localhost are served, too."""
+    monkeypatch.setattr("cloning.server.connections.noted_signals", lambda: [])
+    monkeypatch.setattr("cloning.server.connections.serve", lambda listener, app, stopped, *_: stopped.append(2))
+    told = call_here(drive.main, "drive.py", model_file, "--host", "localhost", "--port", 0).stderr
+    assert re.search(r"\nListening on localhost:(\d+)\.[\s\S]+\nWatch at http://127\.0\.0\.1:\1/ ", told), told
+
+
 @pytest.mark.parametrize("module", ["drive", "cloning.browse.__main__"])
 @pytest.mark.parametrize(
     "change, words",
