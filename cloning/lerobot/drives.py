@@ -35,7 +35,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
     try:
         cameras = [name for name, kind in zip(*lines[:2], strict=False) if kind == "image_array"]
         paths, deleted = [folder / name for name in lines[4]["paths"]], set(lines[4].get("deleted_indexes") or ())
-    except (AttributeError, IndexError, KeyError, TypeError):
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         remedy = "line 5 names no catalogs: not of a tub of version 2; copy it again"
         raise RecordingError(f"{folder / MANIFEST}: {remedy}") from None
     usual = "cam/image_array"
