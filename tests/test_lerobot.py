@@ -23,6 +23,7 @@ from cloning.recordings.log import CheckedRecording, read_recording
 from cloning.recordings.saved_frames import FrameSaver
 
 CENTER = "observation.images.center"
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:"  # a clone's file without git-lfs
 IMAGE = '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": %s}'
 VAST = {"action": {"dtype": "float32", "shape": [10**6], "names": None}}
 
@@ -278,8 +279,9 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
     ("damage", "message"),
     [
         (lambda folder: (folder / "meta/info.json").write_bytes(b"{"), "not a data set in LeRobot"),
-        (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").write_bytes(b"PAR1"), "copy it again"),
+        (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").write_bytes(POINTER), "`git lfs pull`"),
         (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").unlink(), "parquet: no such file; copy it"),
+        (lambda folder: (folder / "videos" / CENTER / "chunk-000/file-000.mp4").write_bytes(POINTER), "`git lfs pull`"),
         (lambda folder: shutil.rmtree(folder / "videos" / CENTER), "No such file or directory"),
         (lambda folder: edit(folder, features=[]), "not a data set in LeRobot"),
         (lambda folder: edit(folder, fps=0), "not a data set in LeRobot"),
@@ -288,7 +290,7 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
         (lambda folder: edit(folder, features=features(folder) | VAST), "action:999, recorded_at:recorded_at"),
         (lambda folder: edit(folder, video_path="http://127.0.0.1:1/film"), "127.0.0.1:1/film: No such file"),
     ],
-    ids=["info", "table", "no table", "film", "features", "rate", "short film", "gap", "vast", "no file"],
+    ids=["info", "table", "no table", "film", "no film", "features", "rate", "short film", "gap", "vast", "no file"],
 )
 def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, monkeypatch, damage, message):
     damage(data_set)
@@ -318,6 +320,8 @@ def test_a_last_row_that_a_power_failure_cut_short_is_left_out_of_a_tub(tub, tmp
 def test_a_damaged_manifest_of_a_tub_is_reported(tub, tmp_path, last):
     lines = (tub / "manifest.json").read_text(encoding="utf-8").splitlines()
     (tub / "manifest.json").write_text("\n".join([*lines[:4], last]), encoding="utf-8")
+    assert "manifest.json: line 5 names no catalogs" in refused(tub, "--output", tmp_path / "recording")
+    (tub / "manifest.json").write_text(lines[0], encoding="utf-8")
     assert "manifest.json: line 5 names no catalogs" in refused(tub, "--output", tmp_path / "recording")
 
 

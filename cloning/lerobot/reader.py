@@ -20,6 +20,7 @@ from cloning.recordings.format import CAMERAS, NUMBERS
 INFO = "meta/info.json"
 # What reading a file raises that is another than LeRobot's, or damaged
 WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, pa.ArrowException)
+CLONE = "or run `git lfs pull` where git has cloned it"
 MOST_NUMBERS = 1000  # of a feature without names; a damaged file may tell of any number
 
 
@@ -33,12 +34,12 @@ def read_data_set(folder: Path, camera: str | None, steering: str | None) -> Ite
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         yield from _rows(folder, info, _cameras(info, camera), _columns(info, steering))
     except av.FFmpegError as error:
-        raise RecordingError(f"{error.filename or folder}: {error.strerror}; copy the film again") from error
+        raise RecordingError(f"{error.filename or folder}: {error.strerror}; copy the film again, {CLONE}") from error
     except FileNotFoundError as error:  # of PyArrow, without the reason
         raise RecordingError(f"{error.filename or error}: no such file; copy it again") from error
     except WRONG as error:
-        problem = f"{type(error).__name__}: {error}"
-        raise RecordingError(f"not a data set in LeRobot's format v3 or v2: {problem}; copy it again") from error
+        problem = f"{type(error).__name__}: {error}; copy it again, {CLONE}"
+        raise RecordingError(f"not a data set in LeRobot's format v3 or v2: {problem}") from error
 
 
 def _cameras(info: dict[str, Any], camera: str | None) -> list[str]:

@@ -98,7 +98,8 @@ def find_folders(given: Iterable[str | Path], exact: bool = False) -> list[Path]
         if not path.exists():
             raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
         if path.is_file():
-            raise RecordingError(f"{path}: a file; name the folder of a recording, with {DRIVING_LOG} and IMG/")
+            wanted = f"the folder of a recording, with {DRIVING_LOG} and IMG/, unpacked if it is an archive"
+            raise RecordingError(f"{path}: a file; name {wanted}")
         found = [path] if exact and (path / DRIVING_LOG).is_file() else sorted(folders_below(path))
         if not found and (path / DRIVEN).is_file():
             command = as_typed("python", "-m", "cloning.lerobot", path, "--output", f"{path}-recording")
