@@ -84,6 +84,8 @@ def test_a_missing_server_is_waited_for_then_reported(capsys, monkeypatch):
     assert re.search(rf"no server at 127\.0\.0\.1.*; {start}", told)
     assert re.search(r"^python: no server at 127\.0\.0\.1.*no usable answer in 0\.5 s.*drive\.py", told, re.MULTILINE)
     port = unused_port()
+    assert main(["drive", "--wait", "0.1", "--host", "::1", "--port", str(port)]) == 2
+    assert f"start `python drive.py --host ::1 --port {port}` in another terminal" in capsys.readouterr().err
     assert main(["join", "--dialect", "roads", "--wait", "0.5", "--port", str(port)]) == 2
     missing = rf"no server at 127\.0\.0\.1:{port} \(.*\); start the program, or name its --port; "
     assert re.search(f"{missing}trying again for 0.5 s\n.*: {missing}waited 0.5 s$", capsys.readouterr().err)

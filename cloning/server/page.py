@@ -29,7 +29,7 @@ from cloning.road.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
 from cloning.server import site
-from cloning.wire.protocol import PORT, Place
+from cloning.wire.protocol import PORT, Place, where_options
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
@@ -173,8 +173,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
 
 def stand_in(words: str, host: str, port: str) -> str:
     """Return a command of the stand-in simulator, with the options by which it connects to a server."""
-    where = f" --host {host}" * (host not in ("127.0.0.1", "localhost")) + f" --port {port}" * (port != str(PORT))
-    return program.in_commands(f"python -m simulator {words}{where}")
+    return program.in_commands(f"python -m simulator {words}{where_options(host, port)}")
 
 
 def posted(name: str, kind: type) -> Any:

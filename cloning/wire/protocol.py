@@ -20,3 +20,8 @@ class Place:
     offset: float  # m to the right of the road's centre line
     departures: int  # how often it has left the road
     time: float  # simulated seconds
+
+
+def where_options(host: str, port: int | str) -> str:
+    """Return the options with which a command listens or connects there, each after a space; none at the usual one."""
+    return f" --host {host}" * (host not in ("127.0.0.1", "localhost")) + f" --port {port}" * (str(port) != str(PORT))

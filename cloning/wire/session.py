@@ -21,7 +21,7 @@ from cloning.wire.client import (
     NoServer,
     parse_answer,
 )
-from cloning.wire.protocol import PORT
+from cloning.wire.protocol import where_options
 
 OPENS = 2  # telemetries sent at the start: the real client's "open" event fires twice
 RETRY_INTERVAL = 0.1  # s between two attempts to connect; the real client makes thousands a second
@@ -35,7 +35,7 @@ class ClientSession:
     (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
     """
 
-    remedy = "; start `python drive.py{}` in another terminal"  # where there is no server; {}: its port
+    remedy = "; start `python drive.py{}` in another terminal"  # where there is no server; {}: its host and port
     connect_timeout = CONNECT_TIMEOUT
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
@@ -101,8 +101,7 @@ class ClientSession:
         time.sleep(RETRY_INTERVAL)
 
     def _remedy_for(self, error: ConnectionLost | None) -> str:
-        port = self.address[1]
-        return self.remedy.format(f" --port {port}" * (port != PORT)) if isinstance(error, NoServer) else ""
+        return self.remedy.format(where_options(*self.address)) if isinstance(error, NoServer) else ""
 
     def progressed(self) -> None:
         """Begin `wait` anew, because an answer has driven the car."""
