@@ -151,6 +151,13 @@ def test_the_usage_is_shown_whatever_the_console_can_show(monkeypatch, code_page
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("usage: behavioral-cloning COMMAND ...")
 
 
+def test_a_notebooks_way_to_show_figures_is_none_of_a_commands(monkeypatch):
+    """Jupyter and Colab set it for `!python model.py`, too, whose environment has not their library."""
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    done = run("-c", "from cloning.base import program; program.end_on_interrupt('test'); import matplotlib")
+    assert done.returncode == 0, done.stderr
+
+
 def test_an_old_python_is_told_in_one_sentence():
     version = "import sys; sys.version_info, sys.hexversion = (3, 10, 4), 0x30A04F0"
     done = run("-c", f"{version}; import runpy; runpy.run_path('model.py', run_name='__main__')")

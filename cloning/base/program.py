@@ -79,6 +79,7 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     name = program
     gc.disable()  # until `run`: libraries leave no garbage while they load, and looking for it takes 0.2 s
     sys.excepthook = _tell
+    os.environ.pop("MPLBACKEND", None)  # a notebook's, whose library may not be here; no command shows figures
 
     def stop(signal_number: int, _: FrameType | None) -> None:
         print(f"{program}: {message}", file=sys.stderr, flush=True)
