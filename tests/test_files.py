@@ -71,6 +71,10 @@ def test_on_windows_a_program_that_has_the_file_open_for_a_moment_is_waited_for(
     tries.clear()
     write(tmp_path / "file", b"new")
     assert (tmp_path / "file").read_bytes() == b"new" and len(tries) == 3
+    monkeypatch.setattr("cloning.base.files.HELD_OPEN", -1.0)
+    tries.clear()
+    with pytest.raises(PermissionError, match=r"Access is denied .*close it there.*file'"):
+        write(tmp_path / "file", b"newer")
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, ValueError])

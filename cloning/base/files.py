@@ -103,8 +103,10 @@ def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:
     while True:
         try:
             return rename(old, new)
-        except PermissionError:
+        except PermissionError as error:
             if time.monotonic() >= until:
+                if sys.platform == "win32":  # Excel has a table open for as long as it shows it
+                    error.strerror = f"{error.strerror} (if another program has it open: close it there)"
                 raise
         time.sleep(0.05)
 
