@@ -25,8 +25,8 @@ from cloning.recordings.saved_frames import DRIVEN
 
 WHERE_TO_GET_RECORDINGS = (
     "Record some: in the simulator (training mode, button R), or by `python -m simulator record data/lake-ccw`; or "
-    "unpack the public sample data there: data/README.md says how. A recording is a folder with "
-    f"{DRIVING_LOG} and {IMAGE_FOLDER}/."
+    f"unpack the public sample data there: data/README.md says how. A recording is a folder with {DRIVING_LOG} and "
+    f"{IMAGE_FOLDER}/. donkeycar's tubs and LeRobot's data sets become recordings by `python -m cloning.lerobot`."
 )
 SHOWN_REJECTED = 5  # rows of each finding that are printed, so that a damaged recording does not fill the screen
 STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
