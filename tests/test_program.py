@@ -10,7 +10,7 @@ import pytest
 import warm
 from commands import HERE, ROOT, python
 
-from cloning.base import progress
+from cloning.base import cores, progress
 from cloning.base.outputs import as_typed
 from cloning.base.program import FAILED
 
@@ -156,6 +156,24 @@ def test_a_notebooks_way_to_show_figures_is_none_of_a_commands(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     done = run("-c", "from cloning.base import program; program.end_on_interrupt('test'); import matplotlib")
     assert done.returncode == 0, done.stderr
+
+
+def test_where_somebody_types_python_it_goes_on():
+    """In a notebook the whole kernel would end with `%run model.py`."""
+    ends = "from cloning.base import program; program.end_on_interrupt('test'); program.run(lambda: 3)"
+    typed = "import signal; signal.raise_signal(signal.SIGINT)\nprint('alive')\n"
+    command = [sys.executable, "-i", "-c", ends]
+    done = subprocess.run(command, input=typed, capture_output=True, text=True, cwd=ROOT)
+    assert "SystemExit: 3" in done.stderr and "KeyboardInterrupt" in done.stderr and done.stdout == "alive\n"
+
+
+@pytest.mark.parametrize(("limit", "threads"), [("150000 100000", 2), ("max 100000", 8), ("90000 100000", 1), ("", 8)])
+def test_a_containers_share_of_the_cores_is_all_that_is_used(tmp_path, monkeypatch, limit, threads):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    monkeypatch.setattr(cores, "LIMIT", tmp_path / "cpu.max")
+    assert cores.threads() == 8, "no container"
+    cores.LIMIT.write_text(f"{limit}\n", encoding="ascii")
+    assert cores.threads() == threads
 
 
 def test_an_old_python_is_told_in_one_sentence():

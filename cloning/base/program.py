@@ -184,10 +184,14 @@ def run(main: Callable[[], int | None]) -> NoReturn:
 def leave(status: int | None) -> NoReturn:
     """End the process with an exit status, None for 0, without taking apart the interpreter and its libraries.
 
-    That takes 0.7 s once torch is loaded. Where other threads have work to end, the process ends as usual.
+    That takes 0.7 s once torch is loaded. Where other threads have work to end, the process ends as usual, and where
+    somebody types Python, as in a notebook (`%run model.py`), it goes on.
     """
     import threading
 
+    if sys.flags.interactive or hasattr(sys, "ps1"):
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.exit(status)
     if not all(thread.daemon or thread is threading.main_thread() for thread in threading.enumerate()):
         sys.exit(status)
     atexit._run_exitfuncs()
