@@ -82,6 +82,7 @@ def findings(found: Recording) -> list[tuple[int, Finding]]:
         [line.replace("E-05", "e-05") for line in usual()],  # 19
         ["\ufeff" + usual()[0], *usual()[1:]],
         ['"' + line.replace(",", '", "') + '"' for line in usual()],
+        [re.sub("(/D.+?jpg)", r'"\1"', line) for line in usual("/Doe, John/IMG/")],
         ["steering,center,left,right,speed,brake,throttle", *ordered("3012654", usual())],
         ["left,center,right,steering,throttle,brake,speed", *ordered("1023456", usual("IMG/"))],
         [*usual()[:2], HEADER.replace("steering,throttle", "throttle,steering"), *ordered("0124356", usual()[2:])],

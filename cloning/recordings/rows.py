@@ -157,7 +157,8 @@ class RowReader:
         enough = [mark for mark in "\t;," if text.count(mark) >= len(COLUMNS) - 1]  # commas may also be decimal marks
         delimiter = enough[0] if enough else max(",;\t", key=text.count)
         folder = text[: text.find(CAMERAS[0])]
-        if "," in folder and folder.endswith(("/", "\\")) and text.count(folder) == len(CAMERAS):
+        is_whole = folder.endswith(("/", "\\")) and not folder.startswith('"')  # else quotes keep it together
+        if "," in folder and is_whole and text.count(folder) == len(CAMERAS):
             text = text.replace(folder, "")  # "Doe, John"
         fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))]
         is_first = not self.rows_read and len(self._headers) == 1
