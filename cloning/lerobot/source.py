@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import csv_bytes, folder_written_whole, write
+from cloning.base.files import folder_written_whole, write
 from cloning.base.frame import FRAME
-from cloning.recordings.format import CAMERAS, COLUMNS, DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, NUMBERS, time_stamp
+from cloning.recordings.format import CAMERAS, DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, NUMBERS, time_stamp
 from cloning.recordings.images import encode
+from cloning.recordings.writer import log_bytes
 from cloning.road.camera import CAMERA_OFFSETS
 from cloning.road.warp import warp
 
@@ -81,11 +82,10 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
             names = [f"{camera}_{stamp}.jpg" for camera in CAMERAS]
             for name, frame in zip(names, _three([fit(image, notes) for image in sample.images], notes), strict=True):
                 (temporary / IMAGE_FOLDER / name).write_bytes(encode(frame, JPEG_QUALITY))
-            numbers = [str(np.float32(value)) for value in (steering, min(throttle, 1), min(brake, 1), speed)]
-            rows.append([*(f"{IMAGE_FOLDER}/{name}" for name in names), *numbers])
+            rows.append((names, [np.float32(value) for value in (steering, min(throttle, 1), min(brake, 1), speed)]))
         if not rows:
             raise RecordingError("no usable row")
-        write(temporary / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
+        write(temporary / DRIVING_LOG, log_bytes(folder, rows))
     return len(rows)
 
 

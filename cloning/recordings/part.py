@@ -17,7 +17,6 @@ from cloning.base.outputs import plural
 from cloning.recordings.excluded import TAGS, read_cuts
 from cloning.recordings.format import (
     CAMERAS,
-    COLUMNS,
     DRIVE_GAP,
     DRIVING_LOG,
     IMAGE_FOLDER,
@@ -30,6 +29,7 @@ from cloning.recordings.format import (
 )
 from cloning.recordings.images import jpeg_size, nonblocking, read_jpeg
 from cloning.recordings.log import Recording
+from cloning.recordings.writer import log_bytes
 
 DAY = timedelta(days=1)
 
@@ -63,17 +63,15 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
         raise RecordingError(f"{folder}: exists already; give the new recording another name") from None
     except OSError as error:
         raise RecordingError(f"{folder}: {error.strerror}; make the folder around it writable") from None
-    rows, known = list[list[str]](), list[list[str]]()
+    rows, known = list[tuple[list[str], list[np.float32]]](), list[list[str]]()
     try:
         (folder / IMAGE_FOLDER).mkdir()
         for recording, names in zip(recordings, renamed, strict=True):
             for old, new in names.items():
                 _link(recording.folder / IMAGE_FOLDER / old, folder / IMAGE_FOLDER / new)
-            rows += [
-                [f"{IMAGE_FOLDER}/{names[recording.name(row, camera)]}" for camera in range(len(CAMERAS))]
-                + [str(getattr(recording, name)[row]) for name in NUMBERS]
-                for row in range(len(recording))
-            ]
+            for row in range(len(recording)):
+                images = [names[recording.name(row, camera)] for camera in range(len(CAMERAS))]
+                rows.append((images, [getattr(recording, name)[row] for name in NUMBERS]))
             if all(lanes):
                 centres = {recording.name(row) for row in range(len(recording))}
                 lane, errors = recording.folder / LANE_FILE, "surrogateescape"
@@ -84,7 +82,7 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
             write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
         elif all(lanes):
             notes.append(f"{LANE_FILE} is left out: it names none of these rows")
-        write(folder / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
+        write(folder / DRIVING_LOG, log_bytes(folder, rows))
     except (OSError, csv.Error) as error:
         shutil.rmtree(folder, ignore_errors=True)
         where, why = (error.filename or folder, error.strerror) if isinstance(error, OSError) else (lane, error)

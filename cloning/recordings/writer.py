@@ -9,11 +9,15 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from cloning.base.errors import RecordingError
-from cloning.base.files import written_whole
+from cloning.base.files import csv_bytes, written_whole
 from cloning.base.outputs import claimed
+from cloning.recordings.columns import UnclearLogError, check_numbers
 from cloning.recordings.format import (
     CAMERAS,
+    COLUMNS,
     DRIVE_GAP,
     DRIVING_LOG,
     IMAGE_FOLDER,
@@ -31,6 +35,22 @@ DEFAULT_START = datetime(2018, 1, 1, 12)
 def csharp_number(value: float) -> str:
     """Return a number as C# writes a float: with seven significant digits, for example 6.9E-05."""
     return f"{value + 0:.7G}"  # + 0 turns -0 into 0
+
+
+def log_bytes(folder: Path, rows: Sequence[tuple[Sequence[str], Sequence[np.float32]]]) -> bytes:
+    """Return a folder's whole `driving_log.csv`, as programs that read the simulator's expect it.
+
+    rows: three names of images, and four numbers each. It has whole paths, and no header: most programs take one for a
+    row. Only above numbers that the simulator never writes is there one: without it they would be refused.
+    """
+    images = folder.absolute() / IMAGE_FOLDER
+    try:
+        numbers = np.array([values for _, values in rows], float)
+        has_header = bool(check_numbers(np.arange(len(rows)) + 1, numbers, is_named=False).any())
+    except UnclearLogError:
+        has_header = True
+    lines = [[*(str(images / name) for name in names), *map(str, values)] for names, values in rows]
+    return csv_bytes([list(COLUMNS), *lines] if has_header else lines)
 
 
 def check_name_of_corrections(folder: str | Path) -> None:

@@ -1,0 +1,69 @@
+"""The driving_log.csv of exports and conversions, read as other people's programs read the simulator's: no header."""
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cloning.lerobot.source import Sample, write_recording
+from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import Recording, read_recording
+from cloning.recordings.part import write_part
+
+
+def exported(recording: Recording, folder: Path) -> None:
+    write_part([recording], folder)
+
+
+def converted(recording: Recording, folder: Path) -> None:
+    rows = range(len(recording))
+    numbers = [{name: float(getattr(recording, name)[row]) for name in NUMBERS} for row in rows]
+    images = [[read_frame(recording.path(row, camera)) for camera in range(len(CAMERAS))] for row in rows]
+    samples = [Sample(*each) for each in zip(recording.time.tolist(), images, numbers, strict=True)]
+    write_recording(iter(samples), folder, 1.0, Counter())
+
+
+@pytest.fixture(params=[exported, converted])
+def write(request):
+    return request.param
+
+
+def assert_same(written: Recording, recording: Recording) -> None:
+    for name in (*NUMBERS, "time"):
+        np.testing.assert_array_equal(getattr(written, name), getattr(recording, name))
+    assert not written.rejected
+
+
+def test_other_programs_read_a_written_log_as_the_simulators(write, linked, tmp_path, monkeypatch):
+    """With csv.reader or pandas, a line for a row: with the path as it is, or its last part, however it is split."""
+    monkeypatch.chdir(tmp_path)
+    recording = read_recording(linked).take(slice(4))
+    for folder in (Path("part"), tmp_path / "Doe, John"):
+        write(recording, folder)
+        with open(folder / "driving_log.csv", encoding="utf-8") as file:
+            rows = list(csv.reader(file))
+        table = pd.read_csv(folder / "driving_log.csv", names=list(COLUMNS)).to_numpy().tolist()
+        for at, row in enumerate(rows):
+            for name, by_csv, by_pandas in zip(NUMBERS, row[3:], table[at][3:], strict=True):
+                assert np.float32(by_csv) == np.float32(by_pandas) == getattr(recording, name)[at]
+            images = [folder.absolute() / "IMG" / recording.name(at, camera) for camera in range(3)]
+            assert row[:3] == table[at][:3] == [str(image) for image in images]
+            assert all(image.is_file() for image in images)
+        assert len(rows) == len(table) == 4
+        written = read_recording(folder)
+        assert_same(written, recording)
+        assert not written.repairs
+
+
+@pytest.mark.parametrize("changed", [{"speed": 40}, {"throttle": 0, "brake": 0.5}, {"throttle": 0.5, "brake": 0.5}])
+def test_numbers_that_the_simulator_never_writes_have_a_header(write, changed, linked, tmp_path):
+    """Without it they would be refused: they may be other columns or units."""
+    values = {name: np.full(4, value, np.float32) for name, value in changed.items()}
+    recording = read_recording(linked).take(slice(4), **values)
+    write(recording, tmp_path / "part")
+    assert (tmp_path / "part/driving_log.csv").read_text(encoding="utf-8").startswith(",".join(COLUMNS) + "\n")
+    assert_same(read_recording(tmp_path / "part"), recording)
