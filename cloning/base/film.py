@@ -49,7 +49,8 @@ class FilmWriter:
         """Open the film; it appears at `path` when it is closed.
 
         rate: frames per second; quality: x264's crf, 0..51, lower is better; max_bits: bits/s above which the quality
-        is lowered, or None; key_frames: one at least after so many frames, x264's 250 if None. Raises OSError.
+        is lowered, or None; key_frames: one at least after so many frames, and none is made from later ones, so that
+        programs can cut the film; x264's 250 if None. Raises OSError.
         """
         import av  # slow to import, and not needed without a film
 
@@ -59,7 +60,7 @@ class FilmWriter:
         if max_bits:
             self.options |= {"maxrate": str(max_bits), "bufsize": str(2 * max_bits)}
         if key_frames:
-            self.options["g"] = str(key_frames)
+            self.options |= {"g": str(key_frames), "bf": "0"}
         self.stream: VideoStream | None = None
         self.frames = 0
         self._renaming = contextlib.ExitStack()  # renames the temporary file when it is closed
@@ -70,8 +71,11 @@ class FilmWriter:
             raise OSError(error.errno, error.strerror, str(path)) from error
         self.container = av.open(str(self.temporary), "w", format="mp4", options={"movflags": "faststart"})
 
-    def add(self, frame: np.ndarray) -> None:
-        """Append a frame, uint8 (rows, columns, 3), RGB, of the first frame's size. Raises OSError."""
+    def add(self, frame: np.ndarray, is_key: bool = False) -> None:
+        """Append a frame, uint8 (rows, columns, 3), RGB, of the first frame's size. Raises OSError.
+
+        is_key: make it a key frame, where the film can be cut.
+        """
         # Drop an odd last row or column: yuv420p stores colour at half the resolution.
         frame = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
         with self._discarded_on_error():
@@ -79,6 +83,8 @@ class FilmWriter:
                 self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
                 self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]
             frames = [self.av.VideoFrame.from_ndarray(frame, "rgb24")]
+            if is_key:
+                frames[0].pict_type = self.av.video.frame.PictureType.I
             # Ctrl-C between the two calls would lose what the first returns, and a film is black without its beginning.
             any(map(self.container.mux, map(self.stream.encode, frames)))
         self.frames += 1

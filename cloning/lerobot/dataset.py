@@ -93,9 +93,9 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
                 path.parent.mkdir(parents=True)
                 sampled = []
                 with FilmWriter(path, rate, key_frames=KEY_FRAMES) as film:
-                    for recording, row in rows:
+                    for (recording, row), is_first in zip(rows, columns["frame_index"] == 0, strict=True):
                         frame = read_frame(recording.path(row, CAMERAS.index(camera)))
-                        film.add(frame)
+                        film.add(frame, is_key=is_first)
                         sampled.append(frame[::SAMPLED, ::SAMPLED].copy())
                         bar.update()
                 values[key] = np.stack(sampled)

@@ -1,13 +1,15 @@
-"""The driving_log.csv of exports and conversions, read as other people's programs read the simulator's: no header."""
+"""What other people's programs need of the recordings and data sets that are written here."""
 
 import csv
 from collections import Counter
 from pathlib import Path
 
+import av
 import numpy as np
 import pandas as pd
 import pytest
 
+from cloning.lerobot.dataset import write_data_set
 from cloning.lerobot.source import Sample, write_recording
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS
 from cloning.recordings.images import read_frame
@@ -67,3 +69,15 @@ def test_numbers_that_the_simulator_never_writes_have_a_header(write, changed, l
     write(recording, tmp_path / "part")
     assert (tmp_path / "part/driving_log.csv").read_text(encoding="utf-8").startswith(",".join(COLUMNS) + "\n")
     assert_same(read_recording(tmp_path / "part"), recording)
+
+
+def test_the_films_of_a_data_set_can_be_cut_into_episodes_without_decoding_them(linked, tmp_path):
+    """As Rerun does, which shows no episode of other films without FFmpeg; those of LeRobot's own are so, too."""
+    recording = read_recording(linked)
+    write_data_set([recording.take(slice(7)), recording.take(slice(7, 20))], tmp_path / "set")
+    for path in (tmp_path / "set").rglob("*.mp4"):
+        with av.open(str(path)) as film:
+            packets = [packet for packet in film.demux(video=0) if packet.size]
+        shown = [packet.pts or 0 for packet in packets]
+        assert shown == sorted(shown) == [packet.dts for packet in packets] and len(shown) == 20  # in decoding order
+        assert packets[0].is_keyframe and packets[7].is_keyframe and not packets[6].is_keyframe
