@@ -17,7 +17,7 @@ from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_json
 from cloning.recordings.format import PROBLEM_AREAS, SAMPLE_RATE
-from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
+from cloning.recordings.writer import RecordingWriter, check_name_of_corrections, start_of
 from cloning.road.autonomy import LIMITS
 from cloning.road.disturbances import KINDS, STRENGTHS, Disturbance
 from cloning.road.generated import LANDS, MARKINGS
@@ -251,7 +251,8 @@ def run_correct(arguments: argparse.Namespace) -> int:
 
     check_name_of_corrections(arguments.folder)
     run = Run(chosen_track(arguments), "autonomous")
-    with RecordingWriter(arguments.folder) as recording:
+    round_of = Path(arguments.folder).absolute().name  # the next one, perhaps with the same options, has another name
+    with RecordingWriter(arguments.folder, start_of(arguments.look, run.track.name, round_of)) as recording:
         scene = Scene.of(run.track.source, arguments.look)
         server = (arguments.host, arguments.port, arguments.wait)
         client = CorrectedClient(run, scene, arguments.speed, recording, *server, arguments.disturb)

@@ -4,7 +4,6 @@ import functools
 from collections import deque
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from panda3d.core import TransformState
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.base.progress import progress_bar
-from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
+from cloning.recordings.writer import RecordingWriter, SampleClock, start_of
 from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
@@ -73,19 +72,21 @@ def record(
     """Record the expert's laps into a new folder; return the run and the number of rows. Call it in the main thread.
 
     speed: set speed in mph; recovery: record only returns from the road's edges; disturbance: of all images. The dates
-    in the images' names depend on the seed, not on today's date, so that the same arguments give the same files. Raises
-    RecordingError if the folder can't be written or holds a recording, SimulatorError if a rendering process is killed.
+    in the images' names depend on the other arguments, not on today's date, so that the same give the same files.
+    Raises RecordingError if the folder can't be written or holds a recording, SimulatorError if a rendering process is
+    killed.
     """
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
     clock = SampleClock()
     view = (track.source, look, disturbance, seed)
+    what = (track.name, round(track.length), track.direction, laps, speed, look, recovery, disturbance)
     # A disturbed frame depends on those before it; without a disturbance it depends on the car's pose alone.
     renderers = 1 if disturbance else min(MAX_RENDERERS, threads())
     pending: deque[tuple[Future[list[bytes]], dict[str, Any]]] = deque()  # images being rendered, and their samples
     with ExitStack() as stack:
-        recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
+        recording = stack.enter_context(RecordingWriter(folder, start_of(seed, *what)))
         pool = stack.enter_context(started_workers(renderers))
         for _ in range(renderers):
             pool.submit(_prepare, view)

@@ -8,13 +8,18 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
+from scenes import Here
 
+from cloning.base.errors import RecordingError
 from cloning.lerobot.dataset import write_data_set
 from cloning.lerobot.source import Sample, write_recording
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording
 from cloning.recordings.part import write_part
+from cloning.road.track import Track
+from simulator import __main__ as command
+from simulator import record
 
 
 def exported(recording: Recording, folder: Path) -> None:
@@ -81,3 +86,29 @@ def test_the_films_of_a_data_set_can_be_cut_into_episodes_without_decoding_them(
         shown = [packet.pts or 0 for packet in packets]
         assert shown == sorted(shown) == [packet.dts for packet in packets] and len(shown) == 20  # in decoding order
         assert packets[0].is_keyframe and packets[7].is_keyframe and not packets[6].is_keyframe
+
+
+def test_images_of_several_recordings_fit_into_one_folder(tmp_path, monkeypatch):
+    """Where programs copy them, after `cat */driving_log.csv`: no name of the simulator's, a time, is there twice."""
+    monkeypatch.setattr(record, "started_workers", Here)
+    monkeypatch.setattr(record, "_prepare", lambda view: None)
+    monkeypatch.setattr(record, "_render", lambda view, transform, begins: [b"image"] * 3)
+
+    def names(folder: str, direction: str, **options) -> list[str]:
+        record.record(tmp_path / folder, Track("lake", direction), 0.004, **options)
+        return sorted(path.name for path in (tmp_path / folder / "IMG").iterdir())
+
+    recorded = [names("ccw", "ccw"), names("cw", "cw"), *(names(f"{look}", "ccw", look=look) for look in (1, 2))]
+    recorded += [names("slow", "ccw", speed=20), names("seed", "ccw", seed=1)]
+    assert len(set().union(*recorded)) == sum(map(len, recorded)) > 6 * 3 * 5
+    assert names("again", "ccw") == recorded[0]
+    starts = []
+
+    def begun(folder, start):
+        starts.append(start)
+        raise RecordingError("enough")
+
+    monkeypatch.setattr(command, "RecordingWriter", begun)
+    for name in ("lake-corrections", "lake-2-corrections"):
+        assert command.main(["correct", str(tmp_path / name)]) == 2
+    assert len(set(starts)) == 2

@@ -39,10 +39,10 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
 
     The images are hard links, or copies where the file system has none. Numbers are those that were read, so the new
     log needs no repairs. A `lane.csv` goes along if every recording has one, and it names one of the rows. A recording
-    of the same time as another, as the stand-in makes them, is put so many days later that each stays a drive of its
-    own. The log is written last: a process killed at any time leaves a whole recording, or a folder that is none.
-    Raises RecordingError if the folder exists, if an image is missing, if one of several recordings has images without
-    a time in their names, or if it cannot be written; then nothing is left.
+    of the same time as another, as a copy is, is put so many days later that each stays a drive of its own. The log is
+    written last: a process killed at any time leaves a whole recording, or a folder that is none. Raises RecordingError
+    if the folder exists, if an image is missing, if one of several recordings has images without a time in their names,
+    or if it cannot be written; then nothing is left.
     """
     recordings = sorted(recordings, key=lambda recording: float(recording.time[0]))
     renamed, notes, end = list[dict[str, str]](), list[str](), -inf

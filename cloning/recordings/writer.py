@@ -3,6 +3,7 @@
 import errno
 import math
 import os
+import zlib
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from datetime import datetime, timedelta
@@ -28,8 +29,16 @@ from cloning.recordings.format import (
     time_stamp,
 )
 
-# The start of a recording with seed 0, so that the same command makes the same file names on any day.
 DEFAULT_START = datetime(2018, 1, 1, 12)
+
+
+def start_of(seed: int, *what: object) -> datetime:
+    """Return a date for a recording's start: on any day the same of what is recorded, of something else another.
+
+    So the same command makes the same file names, and others' images do not replace them where programs put those of
+    several recordings into one folder. It is in 1990 to 2018. what: things with a `repr` of their content.
+    """
+    return DEFAULT_START - timedelta(days=(seed + zlib.crc32(repr(what).encode())) % 10_000)
 
 
 def csharp_number(value: float) -> str:
