@@ -1,6 +1,8 @@
 """What the network that comes with the project is trained on, and that an interrupted rendering continues."""
 
+import errno
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -101,6 +103,16 @@ def test_a_repeated_recording_shows_the_images_of_this_run(linked, tmp_path):
     assert (twin / IMAGE_FOLDER).resolve() == source / IMAGE_FOLDER
     with pytest.raises(RecordingError, match=r"now/lake and .*before/lake have the same name"):
         repeat(tmp_path / "repeated", [tmp_path / "before" / "lake", source])
+
+
+def test_on_windows_a_repeated_recording_has_copies_of_the_images(linked, tmp_path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EINVAL, "A required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", refused)
+    [twin] = repeat(tmp_path / "repeated", [linked])
+    assert len(read_recording(twin)) == 60
+    assert read_recording(twin).path(0).read_bytes() == read_recording(linked).path(0).read_bytes()
 
 
 @pytest.fixture

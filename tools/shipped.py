@@ -155,7 +155,11 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
         for name in (DRIVING_LOG, EXCLUDED, LANE_FILE):
             if (recording / name).exists():
                 shutil.copyfile(recording / name, twin / name)
-        (twin / IMAGE_FOLDER).symlink_to((recording / IMAGE_FOLDER).resolve())
+        images = (recording / IMAGE_FOLDER).resolve()
+        try:
+            (twin / IMAGE_FOLDER).symlink_to(images)
+        except OSError:  # which on Windows only an administrator may make
+            shutil.copytree(images, twin / IMAGE_FOLDER)
     return list(twins)
 
 
