@@ -22,6 +22,7 @@ from rendered import film_of
 
 import video
 from cloning.base.film import FilmWriter, frame_rate
+from cloning.base.outputs import as_typed
 from cloning.network.network import Network, save_model
 from cloning.replay import command
 from cloning.replay.replay import Drive
@@ -72,9 +73,9 @@ def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
 def test_other_files_and_unreadable_frames_are_left_out_and_named(run, tmp_path):
     folder = tmp_path / "run.1"
     save(folder, 10)
-    (folder / "notes\x1b.txt").write_text("mine", encoding="utf-8")
+    (folder / "notes\x7f.txt").write_text("mine", encoding="utf-8")
     filmed = "run.1.mp4: 10 frames at 60 frames/s\n"
-    assert run("run.1", "--fps", "60") == (0, filmed + "video.py: left out, not frames: notes\\x1b.txt\n")
+    assert run("run.1", "--fps", "60") == (0, filmed + "video.py: left out, not frames: notes\\x7f.txt\n")
     save(folder, 1, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44))
     (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
     whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
@@ -182,7 +183,11 @@ def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
 
 @pytest.mark.parametrize(
     "name, words",
-    [(None, "model.pt 'my run'` saves"), ("notes.txt", "name the folder in which"), (FIRST, "none of its 1")],
+    [
+        (None, f"{as_typed('model.pt', 'my run')}` saves"),
+        ("notes.txt", "name the folder in which"),
+        (FIRST, "none of its 1"),
+    ],
 )
 def test_no_film_is_a_clear_error(run, tmp_path, name, words):
     if name:
