@@ -1,11 +1,7 @@
 """How a driver drives a road: a model file, an ONNX file or a server, as `simulator drive` does it, or one built in.
 
 An ONNX file whose network does not take the simulator's frames as they are needs a file beside it, of the same name
-with the ending .json, such as `{"crop": [60, 25, 0, 0], "blur": 3, "colour": "YUV", "range": [-1, 1]}`: the rows and
-columns that are cut off at the top, the bottom, the left and the right, the side of a Gaussian blur in pixels, the
-colour space, and what 0 and 255 become, a number each or one for each colour. Without it, or without one of them,
-frames are not cut, not blurred, are RGB, and are not scaled. After the cut and the blur a frame gets the height and
-width that the file's input has.
+with the ending .json, which says how its image is made of one; LEADERBOARD.md has its keys.
 """
 
 import functools
