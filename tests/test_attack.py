@@ -196,6 +196,16 @@ def test_a_new_car_takes_the_place_of_a_connection_without_a_request(server, jpe
         stack.enter_context(Simulator(server.port).open()).drive(telemetry(jpegs[0]))
 
 
+def test_clients_that_have_left_cost_a_new_car_no_time(model_file):
+    """Each would cost it 5 ms, and their requests, of which 192 are kept, could have no place left for it."""
+    slowly = "import cloning.server.server as server; server.OPENING_INTERVAL = 1.0"
+    with serving(model_file, first=slowly) as process:
+        for _ in range(40):
+            with socket.create_connection(("127.0.0.1", process.port), 10) as stranger:
+                stranger.sendall(WEBSOCKET % b"")
+        Simulator(process.port, timeout=20).open().socket.close()
+
+
 @pytest.mark.parametrize("clock", ["100 * now()", "now() + 3600 * next(hours)"])
 def test_no_change_of_the_clock_costs_an_answer(model_file, jpegs, clock):
     """Two minutes pass in 1.2 seconds there, or an hour forwards or back, beside a car that never pings."""

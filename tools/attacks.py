@@ -209,6 +209,7 @@ def all_attacks() -> dict[str, Attack]:
         "odd_versions": flooding(b"", GET % b"/socket.io/?EIO=9&transport=websocket", connections=50, read=True),
         "page_requests": flooding(b"", GET % b"/", connections=100, read=True),
         "reconnections": flooding(WEBSOCKET % b"", connections=50, hold=False),
+        "short_sessions": websockets(then=frame(b"2"), connections=50, hold=False),
         # Many at once
         "idle_connections": flooding(b"", connections=1500),
         "pages": flooding(GET % b"/live", connections=50, read=True),

@@ -94,7 +94,7 @@ class Protocol(eventlet.wsgi.HttpProtocol):
         try:
             super().finish()
         finally:
-            self.rfile.close()  # without: 270 sockets stay open after 3 s of reconnections
+            self.rfile.close()  # without: 50 sockets stay open after pages
 
 
 def whole_requests(app: WSGIApplication, listener: Listener, most: int = MAX_BODY) -> WSGIApplication:
@@ -121,6 +121,14 @@ def refuse(start_response: StartResponse, status: str, reason: str, body: str = 
     log.warning(f"a request is refused: {reason}")
     start_response(status, [("Content-Type", "text/plain"), ("Connection", "close")])
     return [(body or f"{reason}\n").encode()]
+
+
+def has_left(environ: WSGIEnvironment) -> bool:
+    """Return whether the client of a request that has been read has closed its connection."""
+    try:
+        return not environ["eventlet.input"].get_socket().fd.recv(1, socket.MSG_PEEK)
+    except OSError as error:
+        return not isinstance(error, BlockingIOError)
 
 
 def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:

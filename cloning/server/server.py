@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import parse_qs
 from wsgiref.types import StartResponse, WSGIEnvironment
 
-from cloning.server.connections import refuse
+from cloning.server.connections import has_left, refuse
 from cloning.server.libraries import engineio, eventlet, socketio
 from cloning.server.telemetry import UNREADABLE
 from cloning.server.websocket import WebSocket
@@ -18,7 +18,7 @@ MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them se
 HASTE = 0.1  # s by which the turn of a message comes later if it was sent before the last answer
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNANSWERED = 1000  # texts of a client since it was last sent one; without: 10 s of work when `garbage` has gone
-OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside reconnections
+OPENING_INTERVAL = 0.005  # s between two new clients; without: at times 56 ms beside upgrades instead of 16
 PACKET_TYPES = ("1", "3", "4", "5")  # of Engine.IO, besides pings, that a client may send
 # Events that announce attachments count as unreadable: python-socketio keeps any number, 88 MB in 3 s of `attachments`.
 BINARY, UNREADABLE_TEXT = ("45", "46"), '42["telemetry"'
@@ -52,7 +52,7 @@ class Client(engineio.socket.Socket):
         self.is_old = False  # of Engine.IO 3, unlike the simulator
         self.served = time.perf_counter()  # when its last message was handled
         self.waits = False  # for a message to be handled
-        self.last_ping = None  # without: threads that would ping; 38 MB more after 20 s of reconnections
+        self.last_ping = None  # without: threads that would ping; 23 MB more after 20 s of short_sessions
         self.expects_pings = False
         self.unanswered = 0  # texts since it was last sent one
 
@@ -159,6 +159,9 @@ class Engine(engineio.Server):
             body = "".join(f"{len(each)}:{each}" for each in both) if is_old else "\x1e".join(both)
             return refuse(start_response, "200 OK", reason, body)
         with self.opening:
+            if has_left(environ):  # without: those that connect and leave at once take all places for a second
+                start_response("400 Bad Request", [])
+                return []
             eventlet.sleep(OPENING_INTERVAL)
         if not self._make_room():
             return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
