@@ -225,9 +225,15 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
 
 
 def digest_of(file: Path) -> str:
-    """Return a digest of a driver's file, and of the one beside an ONNX file that tells how frames become its input."""
-    beside = [file.with_suffix(".json")] if file.suffix == ".onnx" else []
-    return hashlib.sha256(b"".join(each.read_bytes() for each in (file, *beside) if each.is_file())).hexdigest()
+    """Return a digest of a driver's file, and of those beside an ONNX file: how frames become its input, its weights.
+
+    The weights may be in files that the ONNX file names.
+    """
+    parts = [file.read_bytes()] if file.is_file() else []
+    if parts and file.suffix == ".onnx":
+        named = (each for each in sorted(file.parent.iterdir()) if each.name.encode() in parts[0])
+        parts += [each.read_bytes() for each in (file.with_suffix(".json"), *named) if each.is_file()]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def server_address(driver: str) -> tuple[str, int] | None:

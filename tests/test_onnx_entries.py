@@ -45,6 +45,24 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
         assert driving.digest_of(tmp_path / "keras.onnx") != digest, "earlier results are another entry's"
 
 
+def test_a_network_whose_weights_are_beside_it_is_another_entry_with_others(tmp_path):
+    """Current PyTorch exports them so."""
+    import onnx
+
+    path, weights = tmp_path / "own.onnx", tmp_path / "own.onnx.data"
+    steers, digests = [], set()
+    for constant in (0.25, -0.5):
+        model = onnx.load(onnx_file(path, (1, 160, 320, 3), [1, 2, 3], kind=1))
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.full(1, constant, np.float32), "weight"))
+        model.graph.node.append(onnx.helper.make_node("Add", ["steering", "weight"], ["angle"]))
+        model.graph.output[0].name = "angle"
+        weights.unlink(missing_ok=True)  # else ONNX would append to it
+        onnx.save(model, path, save_as_external_data=True, location=weights.name, size_threshold=0)
+        digests.add(driving.digest_of(path))
+        steers.append(driving.load_driver(str(path))(np.zeros((160, 320, 3), np.uint8)))
+    assert steers == [0.25, -0.5] and len(digests) == 2
+
+
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):
     file = onnx_file(tmp_path / "own.onnx", (None, 160, 320, 3), [1, 2], kind=2)
     assert driving.load_driver(file)(np.full((160, 320, 3), (0, 200, 200), np.uint8)) == 0
