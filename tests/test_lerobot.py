@@ -344,6 +344,14 @@ def test_rows_with_the_same_time_are_of_one_drive_and_have_images_of_their_own(t
     assert np.diff(read_recording(tmp_path / "one").time) == pytest.approx(0.001, abs=1e-6)
 
 
+def test_images_of_two_sources_without_dates_have_different_names(tmp_path):
+    sample = Sample(0.5, [np.zeros((160, 320, 3), np.uint8)], {"steering": 0.0})
+    for name in ("one", "two"):
+        write_recording(iter([sample]), tmp_path / name, 1.0, Counter())
+    one, two = ({path.name for path in (tmp_path / name / "IMG").iterdir()} for name in ("one", "two"))
+    assert len(one) == len(two) == 3 and not one & two
+
+
 def test_a_recording_without_images_is_left_out(recordings, tmp_path):
     (tmp_path / "bare").mkdir()
     shutil.copy(recordings[0] / "driving_log.csv", tmp_path / "bare")

@@ -14,13 +14,14 @@ from cloning.base.files import folder_written_whole, write
 from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, NUMBERS, time_stamp
 from cloning.recordings.images import encode
-from cloning.recordings.writer import log_bytes
+from cloning.recordings.writer import log_bytes, start_of
 from cloning.road.camera import CAMERA_OFFSETS
 from cloning.road.warp import warp
 
 JPEG_QUALITY = 95  # of images that were compressed before
 ROUNDING = 1e-6  # of the steering at full lock
 LATEST = 1e10  # s: a later time, after the year 2286, is none
+UNDATED = 1e8  # s since 1970: an earlier time is no date, but counts from the source's beginning
 MILLISECOND = 0.001  # s: two images with the same time stamp would have the same name
 NOT_THERE = {
     "throttle": "no throttle: 0 is written; train with --throttle-threshold 0",
@@ -51,6 +52,7 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
     OSError, also if the folder exists; then nothing is written.
     """
     rows, shift, before, last = [], 0.0, -np.inf, -np.inf
+    start: datetime | None = None  # the time 0
     with folder_written_whole(folder) as temporary:
         (temporary / IMAGE_FOLDER).mkdir()
         for sample in samples:
@@ -78,7 +80,9 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
                 shift += last + 2 * DRIVE_GAP - time
                 time = last + 2 * DRIVE_GAP
             before, last = time, round(max(time, last + MILLISECOND), 6)  # else the sum falls short of a millisecond
-            stamp = time_stamp(datetime(1970, 1, 1) + timedelta(seconds=last))
+            if start is None:  # others' images get other names where programs put several recordings into one folder
+                start = datetime(1970, 1, 1) if last > UNDATED else start_of(0, folder.name)
+            stamp = time_stamp(start + timedelta(seconds=last))
             names = [f"{camera}_{stamp}.jpg" for camera in CAMERAS]
             for name, frame in zip(names, _three([fit(image, notes) for image in sample.images], notes), strict=True):
                 (temporary / IMAGE_FOLDER / name).write_bytes(encode(frame, JPEG_QUALITY))
