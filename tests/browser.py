@@ -1,12 +1,11 @@
-"""A real Chromium for the tests, driven over a pipe in its DevTools protocol."""
+"""A real Chromium for the tests, driven in its DevTools protocol."""
 
 import base64
 import json
-import os
 import re
-import select
 import shutil
 import subprocess
+import urllib.request
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import websocket
 from drive_process import awaited
 
 AXE = Path(__file__).with_name("axe.min.js")  # axe-core 4.14.1 by Deque Systems, MPL-2.0: see axe.LICENSE
@@ -22,7 +22,7 @@ needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
 LOOKS = [(390, True), (1280, False), (2200, True)]  # widths in px, and whether the system's colours are dark
 OPTIONS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
-    *("--disable-background-networking", "--disable-component-update", "--remote-debugging-pipe"),
+    *("--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"),
 )
 
 
@@ -32,24 +32,15 @@ class Page:
     until = staticmethod(awaited)
 
     def __init__(self, profile: Path):
-        inward, outgoing = os.pipe()
-        self.incoming, outward = os.pipe()
-        self.outgoing = open(outgoing, "wb")  # noqa: SIM115 - closed in close(); a signal cuts what os.write writes
-        # Chromium reads at 3 and writes at 4; the shell puts the pipes there.
-        command = ["bash", "-c", f'exec "$0" "$@" 3<&{inward} 4>&{outward}', CHROMIUM, *OPTIONS]
-        self.process = subprocess.Popen(
-            [*command, f"--user-data-dir={profile}", "about:blank"],
-            pass_fds=(inward, outward),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        os.close(inward)
-        os.close(outward)
-        self.number, self.buffer = 0, b""
-        self.session: str | None = None
+        command = [CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        written = profile / "DevToolsActivePort"
+        port = self.until(lambda: written.exists() and written.read_text(encoding="utf-8")).split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=60) as listed:
+            tab = next(each for each in json.load(listed) if each["type"] == "page")
+        self.socket = websocket.create_connection(tab["webSocketDebuggerUrl"], timeout=60, suppress_origin=True)
+        self.number = 0
         self.events: list[dict] = []
-        tabs = self.until(lambda: [t for t in self.send("Target.getTargets")["targetInfos"] if t["type"] == "page"])
-        self.session = self.send("Target.attachToTarget", targetId=tabs[0]["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
         sooner = "const later = setTimeout; setTimeout = (action, ms, ...more) => later(action, ms / 10, ...more)"
@@ -57,26 +48,13 @@ class Page:
 
     def send(self, method: str, **parameters) -> dict:
         self.number += 1
-        message = {"id": self.number, "method": method, "params": parameters}
-        if self.session:
-            message["sessionId"] = self.session
-        self.outgoing.write(json.dumps(message).encode() + b"\0")
-        self.outgoing.flush()
+        self.socket.send(json.dumps({"id": self.number, "method": method, "params": parameters}))
         while True:
-            answer = self.receive()
+            answer = json.loads(self.socket.recv())
             if answer.get("id") == self.number:
                 assert "error" not in answer, answer
                 return answer["result"]
             self.events.append(answer)
-
-    def receive(self) -> dict:
-        while b"\0" not in self.buffer:
-            assert select.select([self.incoming], [], [], 60)[0], "the browser does not answer"
-            data = os.read(self.incoming, 1 << 20)
-            assert data, "the browser has ended"
-            self.buffer += data
-        message, _, self.buffer = self.buffer.partition(b"\0")
-        return json.loads(message)
 
     def run(self, code: str) -> Any:
         """Evaluate JavaScript, await it, and return its value."""
@@ -218,14 +196,11 @@ class Page:
         return [event["params"]["request"]["url"] for event in requests]
 
     def close(self) -> None:
-        with suppress(OSError, AssertionError):
-            self.session = None
+        with suppress(OSError, ValueError, websocket.WebSocketException):  # it may have ended
             self.send("Browser.close")
+        self.socket.close()
         self.process.kill()
         self.process.wait()
-        with suppress(OSError):  # what was written to a browser that has ended
-            self.outgoing.close()
-        os.close(self.incoming)
 
 
 def decoded(picture: bytes) -> np.ndarray:
