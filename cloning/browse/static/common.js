@@ -43,6 +43,13 @@ export function onClick(button, action) {
   };
 }
 
+// A button that does something.
+export function makeButton(text, attributes, action) {
+  const made = make("button", text, attributes);
+  onClick(made, action);
+  return made;
+}
+
 // The attributes of a button that needs more words than it shows: for a screen reader, and as a tooltip.
 export const told = words => ({"aria-label": words, title: words});
 

@@ -1,5 +1,5 @@
 // Several recordings and several models in one table: how they were driven, and how the models steer and drive there.
-import {ask, element, make, many, notice, onClick, renew} from "./common.js";
+import {ask, element, make, makeButton, many, notice, renew} from "./common.js";
 import {LIMITS, waits} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
@@ -26,11 +26,10 @@ export async function showComparison(shown) {
   document.title = "Recordings compared";
   element("comparison").hidden = false;
   renew(element("comparing"), [now.limit, ids], () => ["Replays at a limit of", ...LIMITS.map(limit => {
-    const button = make("button", `${limit} m`, {
-      "aria-pressed": limit == now.limit, title: `A model is set back when it is ${limit} m from the lane's centre`});
     const state = new URLSearchParams({...ids && {ids}, limit});
-    onClick(button, () => location.hash = `#/compare?${state}`);
-    return button;
+    const title = `A model is set back when it is ${limit} m from the lane's centre`;
+    return makeButton(`${limit} m`, {"aria-pressed": limit == now.limit, title},
+      () => location.hash = `#/compare?${state}`);
   })]);
   await refresh(now, "GET");
 }

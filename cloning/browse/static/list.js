@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, histogram, make, many, notice, onClick, refill, renew, request} from "./common.js";
+import {ask, element, histogram, make, makeButton, many, notice, refill, renew, request} from "./common.js";
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
@@ -101,10 +101,10 @@ function arrange() {
   const left = states.filter(state => PENDING.includes(state)).length;
   renew(element("analysing"), [left, isPaused], () => {
     const title = "Pause the analyses of all recordings, or go on with them";
-    const button = make("button", isPaused ? "Go on" : "Pause", {title});
-    onClick(button, () => request("/analyses", {method: isPaused ? "POST" : "DELETE"})
-      .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown))))
-      .catch(error => notice(error.message)));
+    const button = makeButton(isPaused ? "Go on" : "Pause", {title}, () =>
+      request("/analyses", {method: isPaused ? "POST" : "DELETE"})
+        .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown))))
+        .catch(error => notice(error.message)));
     return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
   });
 }
@@ -222,10 +222,9 @@ function draw(overview, card) {
     ...words(overview).length ? [make("p", words(overview).join(", "), {class: "found"})] : [],
     make("p", overview.folder, {class: "quiet"})];
   if (lane.state == "failed") {
-    const retry = make("button", "Look for the road again", {title: "Do the analysis again that failed"}), now = shown;
-    onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"})
-      .then(() => fill(id, card, now)).catch(error => notice(error.message)));
-    children.push(retry);
+    const how = {title: "Do the analysis again that failed"}, now = shown;
+    children.push(makeButton("Look for the road again", how, () => ask(`/${id}/columns/offset`, {method: "POST"})
+      .then(() => fill(id, card, now)).catch(error => notice(error.message))));
   }
   refill(card, children);
   histograms.get(card)?.destroy();

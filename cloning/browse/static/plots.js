@@ -21,8 +21,6 @@ export class Plots {
     this.rows = Array.from({length: this.count}, (_, row) => row);
     this.resizing = new ResizeObserver(() => this.fit());
     this.resizing.observe(element("plots"));
-    this.dark = matchMedia("(prefers-color-scheme: dark)");
-    this.redo = () => this.build();
     const release = () => setTimeout(() => { // after the plot has heard of it
       this.held = false;
       if (this.late) this.build();
@@ -31,7 +29,6 @@ export class Plots {
       this.held = true;
       for (const ended of ["pointerup", "pointercancel"]) addEventListener(ended, release, {once: true});
     };
-    this.dark.addEventListener("change", this.redo);
     this.build();
   }
 
@@ -51,7 +48,6 @@ export class Plots {
 
   close() {
     this.resizing.disconnect();
-    this.dark.removeEventListener("change", this.redo);
     this.plots.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
   }

@@ -1,5 +1,5 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
-import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
+import {ask, element, make, makeButton, many, notice, onClick, renew, request} from "./common.js";
 import {changes, cutMarked, mark, redo, showCuts, showStretches, undo} from "./cuts.js";
 import {askToExport, find, setCondition, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
@@ -183,9 +183,9 @@ function showFindings() {
 
 // A button that ends the analyses until they are to go on, those of other recordings, too.
 function pauseButton(text, method) {
-  const button = make("button", text, {title: TITLES[text]}), now = page.open;
-  onClick(button, () => request("/analyses", {method}).then(() => refresh(now)).catch(error => notice(error.message)));
-  return button;
+  const now = page.open;
+  return makeButton(text, {title: TITLES[text]},
+    () => request("/analyses", {method}).then(() => refresh(now)).catch(error => notice(error.message)));
 }
 
 function buttons() {
@@ -258,3 +258,4 @@ for (const button of document.querySelectorAll("[data-key]")) {
   onClick(button, event => pressed(button.dataset.key, event.shiftKey || button.dataset.key == "G"));
 }
 element("scrub").oninput = () => page.open && seek(Number(element("scrub").value));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page.open?.plots.build());

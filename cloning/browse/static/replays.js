@@ -1,5 +1,5 @@
 // Replays of the recording with each model as the driver, and what a model looks at.
-import {clock, element, make, many, onClick, renew, told} from "./common.js";
+import {clock, element, make, makeButton, many, onClick, renew, told} from "./common.js";
 import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
 import {order, orderButton, page, remember, say} from "./state.js";
@@ -40,11 +40,9 @@ export function cameras() {
 // Show the buttons for models, if there are any: at once, so that nothing moves later.
 export function offerModels({models}) {
   element("replaying").hidden = element("watching").hidden = !models.length;
-  renew(element("attention"), models.map(({name}) => name), () => models.map(({name}, index) => {
-    const button = make("button", name, {title: `Show in magenta what ${name} looks at (A)`});
-    onClick(button, () => watch(page.open.attention == index ? null : index));
-    return button;
-  }));
+  renew(element("attention"), models.map(({name}) => name), () => models.map(({name}, index) =>
+    makeButton(name, {title: `Show in magenta what ${name} looks at (A)`},
+      () => watch(page.open.attention == index ? null : index))));
 }
 
 // Show the replays at the chosen limit as far as they are: curves, pictures, figures, interventions. Return whether they
@@ -119,8 +117,7 @@ function section(replay, index) {
     if (!all.length) return;
     made.append(make("ol", "", {class: `where ${kind}`}, ...all.map(([row, words, answer]) => {
       const time = clock(page.open.columns.seconds[row]);
-      const go = make("button", time, told(`Go to the ${what} at ${time}`));
-      onClick(go, () => {
+      const go = makeButton(time, told(`Go to the ${what} at ${time}`), () => {
         seek(row);
         say(answer);
       });

@@ -1,6 +1,6 @@
 // A training run: how far it is, its drift and losses beside other runs', and the pictures of what it trains on; it
 // refreshes itself.
-import {element, make, many, notice, onClick, palette, renew, request} from "./common.js";
+import {element, make, makeButton, many, notice, palette, renew, request} from "./common.js";
 import {MODEL_COLOURS, most} from "./plots.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
@@ -11,7 +11,6 @@ const LOSSES = 0.98; // share of the losses within the epochs that the plot show
 // {id, run, runs, others, smooth, at, plots, timer}; smooth: 0..0.99, of the losses' moving average; at: observations of
 // the picture that was chosen, undefined for the latest
 let open;
-const dark = matchMedia("(prefers-color-scheme: dark)");
 
 export function leaveRun() {
   if (!open) return;
@@ -117,10 +116,9 @@ function update({all, runs}) {
   const others = all.filter(each => each.id != now.id && !each.message);
   const overlay = each => {
     const isShown = now.others.includes(String(each.id));
-    const button = make("button", each.name, {"aria-pressed": isShown, title: each.folder});
     const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
-    onClick(button, () => location.hash = addressOf(open, chosen)); // it may be of an earlier visit
-    return button;
+    return makeButton(each.name, {"aria-pressed": isShown, title: each.folder},
+      () => location.hash = addressOf(open, chosen)); // it may be of an earlier visit
   };
   renew(element("run-others"), [now.others, now.smooth, others.map(({id, folder}) => [id, folder])], () =>
     others.length ? ["Lay over it", ...others.map(overlay)] : []);
@@ -248,6 +246,6 @@ element("smooth").oninput = () => {
   draw();
 };
 element("smooth").onchange = () => history.replaceState(null, "", addressOf(open, open.others));
-dark.addEventListener("change", () => open?.run && draw());
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => open?.run && draw());
 new ResizeObserver(() => open?.plots.forEach(({root, setSize}) =>
   setSize({width: Math.max(200, root.parentNode.clientWidth), height: HEIGHT}))).observe(element("losses"));

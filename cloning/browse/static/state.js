@@ -1,5 +1,5 @@
 // The recording that is shown, for the parts of its page, and the address that shows the same again.
-import {ask, element, make, notice, onClick} from "./common.js";
+import {ask, element, makeButton, notice} from "./common.js";
 
 // Its details and columns, its frames and curves, marks, and the row; undefined while none is shown. recording.js
 // makes it; `update(details)` shows what the server answers, and `orders` counts the changes that it has answered.
@@ -54,8 +54,5 @@ export const TITLES = { // of the buttons that begin and end analyses
   "Try again": "Do the analysis again that failed",
 };
 
-export function orderButton(text, method, path) {
-  const made = make("button", text, {title: TITLES[text]});
-  onClick(made, () => order(method, path));
-  return made;
-}
+export const orderButton = (text, method, path) =>
+  makeButton(text, {title: TITLES[text]}, () => order(method, path));

@@ -81,9 +81,7 @@ function showFigures({rate, frames, unusable, reason, saving, film, convert, bro
   element("record").setAttribute("aria-pressed", recording);
   write("record", recording ? "Stop recording" : "Record");
   for (const each of document.querySelectorAll(".saved")) each.hidden = !film;
-  write("film", film ?? "");
-  write("convert", convert ?? "");
-  write("browse", browse ?? "");
+  for (const [id, command] of Object.entries({film, convert, browse})) write(id, command ?? "");
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
