@@ -70,16 +70,16 @@ def test_the_analysis_that_begins_by_itself_can_be_paused(linked, page, tmp_path
 
 
 def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, page):
-    """Also on its link in a comparison."""
+    """Also on its link in a comparison, and on a button of what is found in it."""
     with browsing(linked) as server:
         server.answer("/analyses", "DELETE")
         page.open(server.base)
         page.shows("article", "paused")
         page.run("""n = 0; own = fetch; fetch = async (path, options) => {
             const answer = await own(path, options);
-            if (!path.match(/overview|compared/)) return answer;
+            if (!path.match(/overview|compared|details/)) return answer;
             const lane = {state: 'running', progress: ++n / 1000};
-            const models = [{name: 'one.pt', steering: lane, replay: lane}];
+            const models = path.includes('details') ? [] : [{name: 'one.pt', steering: lane, replay: lane}];
             return new Response(JSON.stringify({...await answer.json(), lane, models}));
         }; document.querySelector('article a').focus()""")
         page.shows("article", "1 % analysed")
@@ -92,6 +92,11 @@ def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, pag
         page.run("document.querySelector('#table a').focus(); n = 49")
         page.shows("#table", "computing: 5 %")
         assert page.run("document.activeElement.textContent") == "lake"
+        page.click("#table a")
+        page.shows("#findings", "analysed")
+        page.run("document.querySelector('#findings button').focus(); n = 69")
+        page.shows("#findings", "7 % analysed")
+        assert page.run("document.activeElement.textContent") == "Pause"
 
 
 def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):

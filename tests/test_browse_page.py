@@ -387,17 +387,3 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     names = "document.querySelectorAll('#title, #attention button, #plots figcaption > span')"
     page.run(f"{names}.forEach(each => each.textContent = 'a_long_name_'.repeat(9))")
     assert page.fits() and page.run("(({scrollWidth: all, clientWidth: room}) => all <= room)(window['help-button'])")
-
-
-def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):
-    page.open(served.base)
-    page.wait("document.querySelector('article .road')")
-    focused = """import('/static/common.js').then(({make, renew}) => {
-      const holder = document.body.appendChild(document.createElement('div'));
-      const show = name => renew(holder, name, () => [make('button', 'Go'), make('button', name)]);
-      show('Stop: 3 %');
-      holder.lastChild.focus();
-      show('Stop: 4 %');
-      return document.activeElement.textContent;
-    })"""
-    assert page.run(focused) == "Stop: 4 %"

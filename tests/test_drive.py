@@ -62,18 +62,6 @@ def steering_always(output: float) -> Network:
 # Answers
 
 
-def test_a_change_of_the_set_speed_leaves_the_integral_as_it_is(network, jpeg):
-    server = drive.DriveServer(network, 9)
-    session = server.sessions["sid"] = drive.Session(server)
-    for _ in range(50):
-        session.answer(telemetry(jpeg, speed="8.0000"))
-    assert session.controller.error_sum == pytest.approx(50)
-    server.change_set_speed(12.0)
-    answer = session.answer(telemetry(jpeg, speed="8.0000"))
-    assert float(answer["throttle"]) == pytest.approx(0.1 * 4 + 0.002 * (50 + 4))
-    assert drive.Session(server).controller.set_speed == 12, "the next simulator is driven at it, too"
-
-
 def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, network, tmp_path):
     path = tmp_path / "frame.jpg"
     path.write_bytes(jpeg_of(render_frame(0.3, 0.5, np.random.default_rng(0)) // np.array([1, 2, 4], np.uint8)))
@@ -186,18 +174,13 @@ def test_every_culture_is_answered_in_kind(session, jpeg, angle, throttle, speed
 # Status line and log
 
 
-def printed() -> Unblocked:
-    return Unblocked(io.StringIO())
-
-
-def shown(stderr: Unblocked) -> str:
-    """What was printed since the last call."""
-    stderr.finish()
-    assert isinstance(stderr.stream, io.StringIO)
-    text = stderr.stream.getvalue()
-    stderr.stream.seek(0)
-    stderr.stream.truncate()
-    return text
+def printed(status: StatusLine) -> str:
+    """The line, now that it is due."""
+    stream = io.StringIO()
+    status.stderr.stream = stream
+    status.update()
+    status.stderr.finish()
+    return stream.getvalue()
 
 
 def logged(few: Few, messages: list[str], level: int = logging.WARNING) -> list[str]:
@@ -251,7 +234,7 @@ def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight
     for _ in range(3):
         session.answer(telemetry(jpeg), time.perf_counter() - 0.04)
     longest = 1000 * (time.perf_counter() - begin + 0.04)
-    status = StatusLine(session.server, printed())
+    status = StatusLine(session.server, Unblocked(io.StringIO()))
     shown = [float(part.split()[0]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
     on_the_page = [frame.latency for frame in session.history]
     assert shown == [pytest.approx(np.mean(on_the_page), abs=0.06)]
@@ -259,37 +242,32 @@ def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight
 
 
 def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg):
-    stderr = printed()
-    status = StatusLine(session.server, stderr)
+    status = StatusLine(session.server, Unblocked(io.StringIO()))
     status.time -= 3600  # an hour of waiting for a simulator
     session.server.sessions["sid"] = session
     session.answer(telemetry(jpeg))
     session.driven, session.started = 2000, time.perf_counter() - 200.0
-    status.update()
-    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
+    assert float(printed(status).split()[0]) == pytest.approx(10, rel=0.05)
     status.time, status.session = time.perf_counter() - 600, session
     session.driven += 6000
-    status.update()
-    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
+    assert float(printed(status).split()[0]) == pytest.approx(10, rel=0.05)
     later = drive.Session(session.server)
     session.server.sessions["sid"], later.heard = later, time.monotonic()  # of which no frame is driven at first
     for driven in (0, 6000):
         status.time, later.driven = time.perf_counter() - 600, driven
         later.history.extend(session.history)
-        status.update()
-    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
+        line = printed(status)
+    assert float(line.split()[0]) == pytest.approx(10, rel=0.05)
 
 
 def test_escape_sequences_are_for_terminals_only(session, jpeg):
     session.server.sessions["sid"] = session
     session.answer(telemetry(jpeg))
     for is_terminal in (True, False):
-        stderr = printed()
-        stderr.is_terminal = is_terminal
-        status = StatusLine(session.server, stderr)
+        status = StatusLine(session.server, Unblocked(io.StringIO()))
+        status.stderr.is_terminal = is_terminal
         status.time -= 3600
-        status.update()
-        assert ("\033" in shown(stderr)) is is_terminal
+        assert ("\033" in printed(status)) is is_terminal
 
 
 # ----------------------------------------------------------------------------------------------------------------------

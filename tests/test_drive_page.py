@@ -102,13 +102,17 @@ def test_the_benchmark_answers_a_ping_and_waits_for_the_answer():
 
 
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
+    """The sum of its controller stays, and the next simulator is driven at the new speed, too."""
+    usual = telemetry(jpegs[0], speed="9.0000")
     with Simulator(server.port).open() as simulator:
         for set_speed in (11.5, 9.0):
             own = {"Origin": f"http://127.0.0.1:{server.port}", "Sec_Fetch_Site": "same-origin"}
             status, answer = change_set_speed(server, {"set_speed": f"{set_speed}"}, **own)
             assert (status, json.loads(answer)) == (200, {"set_speed": set_speed})
-            throttle = float(simulator.drive(telemetry(jpegs[0], speed="9.0000"))["throttle"])
+            throttle = float(simulator.drive(usual)["throttle"])
             assert throttle == pytest.approx(0.102 * (set_speed - 9) + 0.002 * 2.5 * (set_speed == 9), abs=1e-6)
+            with Simulator(server.port).open() as other:
+                assert float(other.drive(usual)["throttle"]) == pytest.approx(0.102 * (set_speed - 9), abs=1e-6)
             assert shown(server)["set_speed"] == set_speed
 
 
@@ -118,8 +122,10 @@ def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
         ({"Origin": "http://evil.example"}, 403),
         ({"Origin": "null"}, 403),
         ({"Origin": "http://127.0.0.1:1"}, 403),
-        ({"Host": "evil.example"}, 403),
+        ({"Host": "localhost.evil.example:80"}, 403),
+        ({"Host": "0.0.0.0:80"}, 403),  # to which browsers send no Sec-Fetch-Site
         ({"Sec_Fetch_Site": "cross-site"}, 403),
+        ({"Sec_Fetch_Site": "same-site"}, 403),
         ({"Content_Type": "text/plain"}, 415),  # what a form of another site can send
         ({"Content_Type": "application/x-www-form-urlencoded"}, 415),
     ],
