@@ -5,6 +5,7 @@ import os
 import shutil
 
 import numpy as np
+import pytest
 from browse_process import LATE, asks_why, at, browsing, placed, replayed, steered, written, written_run
 from browser import needs_chromium
 from test_excluded import center
@@ -13,6 +14,14 @@ from cloning.browse.analyses import Analysis
 from cloning.recordings.log import read_recording
 
 pytestmark = needs_chromium
+
+
+@pytest.fixture
+def server(linked):
+    """A server of the recording `linked`, as if its lane had been analysed already."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        yield server
 
 
 def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
@@ -99,78 +108,74 @@ def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, pag
         assert page.run("document.activeElement.textContent") == "Pause"
 
 
-def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
-    placed(linked, np.zeros(60))
+def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(server, linked, page):
     cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
     cuts.write_text("spoilt\n", encoding="utf-8")
-    with browsing(linked) as server:
-        page.open(server.base)
-        page.shows("article .bad", "excluded.csv: line 1")
-        once = "if (!path.includes('/overview')) return own(path); fetch = own; failed = true; throw new Error('gone')"
-        page.run(f"failed = false; own = fetch; fetch = async path => {{ {once}; }}; 0")
-        page.wait("failed")
-        page.wait("document.querySelector('#notice').hidden")
-        cuts.unlink()
-        page.wait("document.querySelector('article .road')")
-        page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
-        page.shows("#notice", "does not answer")
-        page.wait("document.querySelector('#notice').hidden && document.querySelector('article .road')")
-        cuts.write_text("spoilt\n", encoding="utf-8")
-        page.run(f"location.hash = '{server.hash('lake')}/7'")
-        page.shows("#notice", "excluded.csv: line 1")
-        assert page.run("document.querySelector('#recording').hidden")
-        cuts.unlink()
-        at(page, 7)
-        linked.rename(elsewhere)
-        page.shows("#notice", "driving_log.csv: No such file")
-        page.press("End")
-        page.shows("figure:has(#center)", "driving_log.csv: No such file")
-        elsewhere.rename(linked)
-        page.wait("document.querySelector('#notice').hidden")
-        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
-        at(page, 59)
+    page.open(server.base)
+    page.shows("article .bad", "excluded.csv: line 1")
+    once = "if (!path.includes('/overview')) return own(path); fetch = own; failed = true; throw new Error('gone')"
+    page.run(f"failed = false; own = fetch; fetch = async path => {{ {once}; }}; 0")
+    page.wait("failed")
+    page.wait("document.querySelector('#notice').hidden")
+    cuts.unlink()
+    page.wait("document.querySelector('article .road')")
+    page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
+    page.shows("#notice", "does not answer")
+    page.wait("document.querySelector('#notice').hidden && document.querySelector('article .road')")
+    cuts.write_text("spoilt\n", encoding="utf-8")
+    page.run(f"location.hash = '{server.hash('lake')}/7'")
+    page.shows("#notice", "excluded.csv: line 1")
+    assert page.run("document.querySelector('#recording').hidden")
+    cuts.unlink()
+    at(page, 7)
+    linked.rename(elsewhere)
+    page.shows("#notice", "driving_log.csv: No such file")
+    page.press("End")
+    page.shows("figure:has(#center)", "driving_log.csv: No such file")
+    elsewhere.rename(linked)
+    page.wait("document.querySelector('#notice').hidden")
+    page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+    at(page, 59)
 
 
-def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_shown_and_undone(linked, page):
+def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_shown_and_undone(server, linked, page):
     """The one before a cut that was deleted elsewhere is undone. A browser tells a tab what another one changes."""
-    placed(linked, np.zeros(60))
     file, header = linked / "excluded.csv", "first image,last image,reason\n"
     cuts = [f"{center(linked, row)},{center(linked, row)},off\n" for row in (0, 1)]
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}")
-        for row in range(2):
-            at(page, row)
-            asks_why(page, *"iox")
-            page.run("document.querySelector('#reason-text').value = 'off'")
-            page.press("Enter")
-            page.wait(f"document.querySelectorAll('#cuts button').length == {2 * row + 2}")
-            page.press("ArrowRight")
-        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
-        file.unlink()
-        file.mkdir()
-        page.press("z")
-        page.shows("#notice", "not a regular file")
-        file.rmdir()
-        file.write_text(header + "".join(cuts), encoding="utf-8")
-        for keys, buttons in (("zz", 0), ("yy", 4)):
-            page.press(*keys)
-            page.wait(f"document.querySelectorAll('#cuts button').length == {buttons}")
-        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
-        file.write_text(header + cuts[0], encoding="utf-8")
-        page.press("z")
-        page.shows("#notice", "it was deleted elsewhere")
-        page.press("z")
-        page.shows("#cuts", "None")
-        assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
-        cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
-        file.write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
-        key = f"cuts-{server.hash('lake').removeprefix('#/')}"
-        kept = {"done": [{"kind": "cuts", "method": "DELETE", "cuts": [cut]}], "undone": []}
-        page.run(f"localStorage.setItem('{key}', JSON.stringify({json.dumps(kept)}))")
-        page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
-        page.shows("#cuts", "2 frames: off")
-        page.press("z")
-        page.shows("#cuts", "None")
+    page.open(f"{server.base}{server.hash('lake')}")
+    for row in range(2):
+        at(page, row)
+        asks_why(page, *"iox")
+        page.run("document.querySelector('#reason-text').value = 'off'")
+        page.press("Enter")
+        page.wait(f"document.querySelectorAll('#cuts button').length == {2 * row + 2}")
+        page.press("ArrowRight")
+    assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+    file.unlink()
+    file.mkdir()
+    page.press("z")
+    page.shows("#notice", "not a regular file")
+    file.rmdir()
+    file.write_text(header + "".join(cuts), encoding="utf-8")
+    for keys, buttons in (("zz", 0), ("yy", 4)):
+        page.press(*keys)
+        page.wait(f"document.querySelectorAll('#cuts button').length == {buttons}")
+    assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+    file.write_text(header + cuts[0], encoding="utf-8")
+    page.press("z")
+    page.shows("#notice", "it was deleted elsewhere")
+    page.press("z")
+    page.shows("#cuts", "None")
+    assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
+    cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
+    file.write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
+    key = f"cuts-{server.hash('lake').removeprefix('#/')}"
+    kept = {"done": [{"kind": "cuts", "method": "DELETE", "cuts": [cut]}], "undone": []}
+    page.run(f"localStorage.setItem('{key}', JSON.stringify({json.dumps(kept)}))")
+    page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
+    page.shows("#cuts", "2 frames: off")
+    page.press("z")
+    page.shows("#cuts", "None")
 
 
 def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):
@@ -227,54 +232,48 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.wait("document.querySelector('#notice').hidden")
 
 
-def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, page):
+def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(server, linked, page):
     """As while many others are loaded; an error there would stop all frames in the end."""
-    placed(linked, np.zeros(60))
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}/0")
-        at(page, 0)
-        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
-        page.run(LATE % "/rows/1/left")
-        page.press("ArrowRight")
-        page.wait("late.go")
-        page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
-        page.run("new Promise(done => setTimeout(done, 2000)).then(late.go)")
-        frame = read_recording(linked).path(1, 1).read_bytes()
-        page.until(lambda: page.difference("left", frame) < 3, 20)
-        assert page.complaints() == []
+    page.open(f"{server.base}{server.hash('lake')}/0")
+    at(page, 0)
+    page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+    page.run(LATE % "/rows/1/left")
+    page.press("ArrowRight")
+    page.wait("late.go")
+    page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
+    page.run("new Promise(done => setTimeout(done, 2000)).then(late.go)")
+    frame = read_recording(linked).path(1, 1).read_bytes()
+    page.until(lambda: page.difference("left", frame) < 3, 20)
+    assert page.complaints() == []
 
 
-def test_a_comparison_leads_to_what_is_chosen_there(linked, page):
+def test_a_comparison_leads_to_what_is_chosen_there(server, page):
     """Not to what an earlier one with the same figures did, and without a model to no replays."""
-    placed(linked, np.zeros(60))
-    with browsing(linked) as server:
-        page.open(f"{server.base}#/compare?ids={server.hash('lake')[2:]}")
-        page.shows("#table", "lake")
-        page.run("location.hash = '#'")
-        page.wait("!document.querySelector('#list').hidden")
-        page.run("location.hash = '#/compare'")
-        page.wait("!document.querySelector('#comparison').hidden")
-        page.click("#comparing button:last-child")
-        page.wait("location.hash == '#/compare?limit=2.5'")
-        page.wait("document.querySelector('#table a').hash.endsWith('?limit=2.5')")
-        page.click("#table a")
-        at(page, 0)
-        page.wait("location.hash.endsWith('/0')")
-        assert page.run("document.querySelector('#replays').hidden")
+    page.open(f"{server.base}#/compare?ids={server.hash('lake')[2:]}")
+    page.shows("#table", "lake")
+    page.run("location.hash = '#'")
+    page.wait("!document.querySelector('#list').hidden")
+    page.run("location.hash = '#/compare'")
+    page.wait("!document.querySelector('#comparison').hidden")
+    page.click("#comparing button:last-child")
+    page.wait("location.hash == '#/compare?limit=2.5'")
+    page.wait("document.querySelector('#table a').hash.endsWith('?limit=2.5')")
+    page.click("#table a")
+    at(page, 0)
+    page.wait("location.hash.endsWith('/0')")
+    assert page.run("document.querySelector('#replays').hidden")
 
 
-def test_a_recording_is_cut_though_the_browser_stores_nothing(linked, page):
-    placed(linked, np.zeros(60))
+def test_a_recording_is_cut_though_the_browser_stores_nothing(server, page):
     denied = "Object.defineProperty(window, 'localStorage', {get() { throw new DOMException('', 'SecurityError'); }})"
     script = page.send("Page.addScriptToEvaluateOnNewDocument", source=denied)
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}/7?mark=5-9")
-        at(page, 7)
-        asks_why(page, "x")
-        page.press("Enter")
-        page.shows("#said", "Undo takes it back")
-        page.press("z")
-        page.shows("#cuts", "None")
+    page.open(f"{server.base}{server.hash('lake')}/7?mark=5-9")
+    at(page, 7)
+    asks_why(page, "x")
+    page.press("Enter")
+    page.shows("#said", "Undo takes it back")
+    page.press("z")
+    page.shows("#cuts", "None")
     page.send("Page.removeScriptToEvaluateOnNewDocument", **script)
 
 
@@ -310,32 +309,30 @@ def test_runs_of_as_many_epochs_as_there_may_be_are_drawn(page, tmp_path):
         page.wait("document.querySelectorAll('#losses canvas').length == 2")
 
 
-def test_a_late_answer_does_not_take_the_place_of_a_newer_one(linked, page):
+def test_a_late_answer_does_not_take_the_place_of_a_newer_one(server, page):
     """Of what matched before a cut; and of a comparison before its analyses were begun."""
-    placed(linked, np.zeros(60))
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}/7?find=speed > 0&mark=5-9")
-        page.shows("#matches", "60 frames")
-        page.run(LATE % "/matches")
-        page.run("filter.querySelector('input').oninput()")
-        page.wait("late.go")
-        asks_why(page, "x")
-        page.press("Enter")
-        page.shows("#matches", "55 frames")
-        page.run("late.go(); new Promise(done => setTimeout(done, 3000))")
-        assert page.text("#matches") == "55 frames in 2 stretches"
-        page.open(server.base)
-        page.shows("#total", "1 recording")
-        page.run("""late = {}; own = fetch; fetch = async (path, options) => {
-            if (!path.includes('/compared')) return own(path, options);
-            const isBegun = options.method == 'POST', steering = {state: isBegun ? 'waiting' : 'none'};
-            if (!isBegun && !late.go) await new Promise(go => late.go = go);
-            const recording = await (await own(path)).json();
-            const models = [{name: 'one.pt', error: null, steering, replay: steering}];
-            return new Response(JSON.stringify({...recording, models}));
-        }; location.hash = '#/compare'""")
-        page.wait("late.go")
-        page.click("#compare-all")
-        page.shows("#compared", "2 analyses to do")
-        page.run("fetch = () => new Promise(() => {}); late.go(); new Promise(done => setTimeout(done, 3000))")
-        assert page.text("#compared") == "2 analyses to do"
+    page.open(f"{server.base}{server.hash('lake')}/7?find=speed > 0&mark=5-9")
+    page.shows("#matches", "60 frames")
+    page.run(LATE % "/matches")
+    page.run("filter.querySelector('input').oninput()")
+    page.wait("late.go")
+    asks_why(page, "x")
+    page.press("Enter")
+    page.shows("#matches", "55 frames")
+    page.run("late.go(); new Promise(done => setTimeout(done, 3000))")
+    assert page.text("#matches") == "55 frames in 2 stretches"
+    page.open(server.base)
+    page.shows("#total", "1 recording")
+    page.run("""late = {}; own = fetch; fetch = async (path, options) => {
+        if (!path.includes('/compared')) return own(path, options);
+        const isBegun = options.method == 'POST', steering = {state: isBegun ? 'waiting' : 'none'};
+        if (!isBegun && !late.go) await new Promise(go => late.go = go);
+        const recording = await (await own(path)).json();
+        const models = [{name: 'one.pt', error: null, steering, replay: steering}];
+        return new Response(JSON.stringify({...recording, models}));
+    }; location.hash = '#/compare'""")
+    page.wait("late.go")
+    page.click("#compare-all")
+    page.shows("#compared", "2 analyses to do")
+    page.run("fetch = () => new Promise(() => {}); late.go(); new Promise(done => setTimeout(done, 3000))")
+    assert page.text("#compared") == "2 analyses to do"
