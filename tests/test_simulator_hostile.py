@@ -188,12 +188,6 @@ def test_a_flood_of_answers_drives_on(realtime):
     assert client.run.travelled >= 0.002 * client.run.track.length
 
 
-@pytest.mark.parametrize("realtime", [False, True])
-def test_answers_given_twice_drive_on(realtime):
-    with Server(lambda packet, n: [AHEAD, AHEAD]) as server:
-        assert drive(server, laps=0.005, realtime=realtime).run.travelled > 5
-
-
 @pytest.mark.parametrize("name", ["greets and closes", "floods what is no answer", "nests deep"])
 def test_a_replay_over_the_wire_ends_as_well(name):
     frame_of_a_replay: Any = SimpleNamespace(speed=0.0, time=0.0, jpeg=lambda: b"a frame")
