@@ -62,10 +62,10 @@ class Page:
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
 
-    def wait(self, code: str, seconds: float = 60.0) -> None:
+    def wait(self, code: str) -> None:
         """Wait until a JavaScript expression is true."""
         try:
-            self.until(lambda: self.run(f"Boolean({code})"), seconds)
+            self.until(lambda: self.run(f"Boolean({code})"))
         except AssertionError as error:
             raise AssertionError(f"{code}: {error}; the page shows: {self.run('document.body.innerText')}") from None
 

@@ -96,10 +96,6 @@ def test_a_replay_begins_only_when_asked_for_and_can_be_stopped(linked, model_fi
         assert state() == state("1") == {"state": "none"}
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# What a model looks at
-
-
 def test_a_replay_is_there_no_more_once_one_of_other_cuts_has_taken_its_place(linked, tmp_path):
     (model := tmp_path / "model.pt").touch()
     placed(linked, np.zeros(60))
@@ -150,6 +146,10 @@ def test_a_log_that_grows_while_it_is_read_is_shown(linked, tmp_path, monkeypatc
         computed._read_once.cache_clear()  # as if other recordings had been looked at
         assert recording.compared("1", begin=False)["models"][0]["error"] is not None
         assert recording.details()["jumps"]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a model looks at
 
 
 def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, model_file):

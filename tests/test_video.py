@@ -225,8 +225,7 @@ def test_a_pause_and_bunches_leave_the_rate_alone():
 def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     torch.manual_seed(0)
     network = Network()
-    layers = dict(network.named_parameters())
-    torch.nn.init.constant_(layers["dense.3.bias"], -0.3)
+    torch.nn.init.constant_(network.get_parameter("dense.3.bias"), -0.3)
     save_model(tmp_path / "model.pt", network)
     save(tmp_path / "run1", 3)
     assert run("run1", "--overlay", "model.pt")[0] == 0
