@@ -214,7 +214,7 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.open(f"{server.base}{here}/7?limit=7&look=3&mark=x-9")
         at(page, 7)
         page.wait(f"location.hash == '{here}/7'")
-        page.run(f"location.hash = '{here}/1.4?mark=9-5&zoom=30-50'")
+        page.run(f"location.hash = '{here}/1.4?mark=9-5&zoom=30-50&look=length'")
         page.wait(f"location.hash == '{here}/1?zoom=30-50&mark=5-9'")
         page.run(f"location.hash = '{here}/-1?zoom=x-5'")
         page.wait(f"location.hash == '{here}/0'")

@@ -69,7 +69,7 @@ export async function showRecording(id, row, shown) {
     return both.map(at => at ? rowOf(at) : undefined);
   };
   const [first, last] = rowsOf("mark"), [low = 0, high = count - 1] = rowsOf("zoom");
-  const looked = shown.get("look"), attention = details.models[looked] ? Number(looked) : null;
+  const looked = parseInt(shown.get("look")), attention = details.models[looked] ? looked : null;
   const now = page.open = {
     id, details, columns, count, marks: first > last ? {first: last, last: first} : {first, last}, ...changes(id),
     stamps: isStale ? {} : stamps, row: rowOf(row), playing: 0, orders: 0,
