@@ -154,18 +154,12 @@ def test_the_place_that_the_stand_in_tells_is_shown_and_any_other_ignored(sessio
     assert session.place is None and session.pilot.predictor.time == 8.25
 
 
-@pytest.mark.parametrize(
-    "angle, throttle, speed, separator",
-    [
-        ("12/3456-", "0/2000", "6/5000", "/"),  # fa-IR
-        ("\u200e\u221212\u066b3456", "0\u066b2000", "6\u066b5000", "\u066b"),
-    ],
-)
-def test_every_culture_is_answered_in_kind(session, jpeg, angle, throttle, speed, separator):
+def test_another_culture_is_answered_in_kind(session, jpeg):
+    """As in Iran; test_telemetry.py has the numbers of the others."""
     expected = drive.Session(session.server).answer(telemetry(jpeg, speed="6.5000"))
-    answer = session.answer({**telemetry(jpeg, speed=speed), "steering_angle": angle, "throttle": throttle})
-    assert answer == {key: value.replace(".", separator) for key, value in expected.items()}
-    assert separator in answer["throttle"] and session.unusable == 0
+    answer = session.answer(telemetry(jpeg, "12/3456-", "0/2000", "6/5000"))
+    assert answer == {key: value.replace(".", "/") for key, value in expected.items()}
+    assert "/" in answer["throttle"] and session.unusable == 0
     assert session.answer({})["steering_angle"] == answer["steering_angle"], "an unusable frame is answered in kind too"
 
 

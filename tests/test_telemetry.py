@@ -50,7 +50,7 @@ def test_anything_else_is_not_a_number(written):
 
 
 @pytest.mark.parametrize("value", [1e-7, -3e-5, 0.1, -1.0, 123456.0, 0.0])
-@pytest.mark.parametrize("separator", [".", ",", "/"])
+@pytest.mark.parametrize("separator", [".", ",", "/", "\u066b"])
 def test_numbers_are_written_without_exponent_and_exactly(value, separator):
     written = format_number(np.float32(value), separator)
     assert "e" not in written

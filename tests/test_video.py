@@ -188,12 +188,8 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, words):
     status, error = run("my run")
     assert status == 2 and words in error
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
-
-
-def test_a_file_is_no_folder(run, tmp_path):
-    (tmp_path / "run1.mp4").write_bytes(b"")
-    status, error = run("run1.mp4")
-    assert status == 2 and "a file; name the folder" in error and "drive.py model.pt" not in error
+    (tmp_path / "run1.mp4").touch()
+    assert run("run1.mp4") == (2, "video.py: run1.mp4: a file; name the folder in which drive.py has saved frames\n")
 
 
 @pytest.mark.parametrize(
