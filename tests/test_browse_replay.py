@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 import time
 from contextlib import closing
@@ -11,10 +10,9 @@ from contextlib import closing
 import cv2
 import numpy as np
 import pytest
-import warm
 from browse_process import browsing, opened, placed, replayed, steered, written_run
 from browser import needs_chromium
-from commands import HERE, trained
+from commands import trained
 from drive_process import awaited
 from test_excluded import center
 
@@ -30,6 +28,7 @@ from cloning.recordings.log import read_recording
 from cloning.replay import replay
 from cloning.replay.model_driver import ModelDriver
 from cloning.road.overlay import MAGENTA, overlay
+from cloning.training.distributed import Ranks
 from cloning.training.run_files import RunFiles
 from simulator import __main__ as simulator
 
@@ -184,23 +183,11 @@ def test_attention_comes_from_a_process_that_is_started_again_when_it_has_ended(
 # ----------------------------------------------------------------------------------------------------------------------
 # Training runs
 
-HELD = """
-import sys
-from cloning.training.distributed import Ranks
-from cloning.training.run_files import RunFiles
-with RunFiles(sys.argv[1]).claimed(Ranks()):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
 
 def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path):
     files = written_run(tmp_path, finished=1, images=500)
-    holding = [sys.executable, "-c", HELD, str(files.last)]
-    pipe = subprocess.PIPE
-    holder = warm.Popen(holding, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **HERE})
-    assert holder.stdout and holder.stdout.readline() == "held\n"
-    found = runs.overview(files)
+    with files.claimed(Ranks()):
+        found = runs.overview(files)
     assert found["state"] == "running" and found["robust"] and found["rate"] == 100 and found["loss"] == 0.25
     # 12.5 s an epoch, with its validation: half of this one and two others are left.
     assert found["left"] == 2.5 * 12.5
@@ -208,8 +195,6 @@ def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path)
     assert found["pictures"] == [0, 1200], "those from 6,400 observations on are an earlier run's"
     assert found["trail"] == [[0.25, 0.5], [0.5, 0.49], [0.75, 0.48], [1.0, 0.47], [1.25, 0.46], [1.5, 0.45]]
     assert found["best"] == {"epoch": 1, "by": "val_loss", "value": 0.5}
-    holder.kill()
-    holder.communicate()
     found = runs.overview(files)
     assert found["state"] == "stopped" and found["left"] is None
 
