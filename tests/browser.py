@@ -36,9 +36,12 @@ class Page:
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         written = profile / "DevToolsActivePort"
         port = self.until(lambda: written.exists() and written.read_text(encoding="utf-8")).split()[0]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=60) as listed:
-            tab = next(each for each in json.load(listed) if each["type"] == "page")
-        self.socket = websocket.create_connection(tab["webSocketDebuggerUrl"], timeout=60, suppress_origin=True)
+
+        def tabs() -> list[str]:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=60) as listed:
+                return [each["webSocketDebuggerUrl"] for each in json.load(listed) if each["type"] == "page"]
+
+        self.socket = websocket.create_connection(self.until(tabs)[0], timeout=60, suppress_origin=True)
         self.number = 0
         self.events: list[dict] = []
         for domain in ("Page", "Runtime", "Log", "Network"):
