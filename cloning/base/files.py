@@ -72,7 +72,6 @@ def locked(folder: Path) -> Iterator[bool | None]:
     else:  # not after it: mypy would report that as never reached
         opened = os.open(folder, os.O_RDONLY)
         _locked.add(opened)
-        _close_in_forks()
         free: bool | None = True
         try:
             try:
@@ -86,15 +85,14 @@ def locked(folder: Path) -> Iterator[bool | None]:
                 os.close(opened)
 
 
-@functools.cache  # once
-def _close_in_forks() -> None:
+def _let_go() -> None:
     """Let a forked process hold none of the folders that this one has locked: it may end later, as after a kill."""
+    while _locked:
+        os.close(_locked.pop())
 
-    def close() -> None:
-        while _locked:
-            os.close(_locked.pop())
 
-    os.register_at_fork(after_in_child=close)
+if sys.platform != "win32":
+    os.register_at_fork(after_in_child=_let_go)
 
 
 def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:

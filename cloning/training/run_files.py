@@ -88,14 +88,6 @@ class RunFiles:
         except FileNotFoundError:
             return False
 
-    def next_step(self, before: tuple[int, int] | None, resumed: bool) -> str:
-        """Return what the user can do after an error.
-
-        before: `state` when the run began: until the run has saved one, --resume would continue an earlier run;
-        resumed: whether --resume was given.
-        """
-        return "continue with --resume" if resumed or self.state() != before else "start the run again"
-
     def state(self) -> tuple[int, int] | None:
         """Return what shows whether model-resume.pt was replaced; None if there is none."""
         now = self.resume.stat() if os.path.exists(self.resume) else None

@@ -80,8 +80,14 @@ class StopSignals:
 
 def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     """Do the work of a run, say on stderr what ended it; return 0, 2 after an error, 128 + signal if stopped."""
-    files, resume = RunFiles(process.output), process.resume
-    status, message, before = 0, "", files.state()
+    files, status, message = RunFiles(process.output), 0, ""
+    before = files.state()
+
+    def next_step() -> str:
+        # Until the run has saved a state, --resume would continue an earlier run.
+        is_its_own = process.resume or files.state() != before
+        return "continue with --resume" if is_its_own else "start the run again"
+
     try:
         process.check()
         with files.claimed(ranks):
@@ -89,16 +95,16 @@ def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     except UserError as error:
         status, message = 2, str(error)
     except OSError as error:
-        remedy = f"all earlier files are intact. Remove the cause and {files.next_step(before, resume)}"
+        remedy = f"all earlier files are intact. Remove the cause and {next_step()}"
         status, message = 2, f"{message_of(error)}; {remedy}"
     except OF_THE_GPU as error:
         told, _, _ = str(error).partition("\n")
-        remedy = f"leave the GPU out with --device cpu, and {files.next_step(before, resume)}"
+        remedy = f"leave the GPU out with --device cpu, and {next_step()}"
         status, message = 2, f"{told}; {remedy}"
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:
-        status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(before, resume)}"
+        status, message = 128 + SIGNALS[0], f"stopped at once; {next_step()}"
     if message and (ranks.first or status == 2):  # the other ranks' errors are their own
         print(program.in_commands(f"{program.name}: {message}"), file=sys.stderr)
     return status
