@@ -110,19 +110,13 @@ def contents(folder: Path) -> dict[str, object]:
 
 @dataclass
 class Trial:
-    """A folder in which a command runs again and again from the same beginning.
-
-    command   to kill
-    begin     a folder: what is there before the command
-    more      options of the next run
-    checked   called after each kill
-    """
+    """A folder in which a command runs again and again from the same beginning."""
 
     folder: Path
-    command: list
-    begin: Path | None = None
-    more: tuple[str, ...] = ()
-    checked: Callable[[], None] = lambda: None
+    command: list  # to kill
+    begin: Path | None = None  # a folder: what is there before the command
+    more: tuple[str, ...] = ()  # options of the next run
+    checked: Callable[[], None] = lambda: None  # called after each kill
     companion: Callable[[Watched], None] = lambda running: None  # does its part while the command runs
     done: int = 0  # the command's exit status; a server's is that of the Ctrl-C with which its companion ends it
     whole: tuple[dict[str, object], list[str]] | None = None  # what `whole_run` has found
@@ -182,14 +176,14 @@ class Trial:
         self.checked()
         assert differences(contents(self.folder), wanted) == []
 
-    def disk_full_everywhere(self, others: int, status: int) -> None:
-        """Fill the disk in the chosen writes; status: the command's."""
+    def disk_full_everywhere(self, others: int) -> None:
+        """Fill the disk in the chosen writes; the command ends with status 2."""
         wanted, points = self.whole_run()
 
         def fill(number: int) -> None:
             ended = self.run(self.command, full=number)
             assert "Traceback" not in ended.printed, ended.printed
-            assert ended.status == status, ended.printed
+            assert ended.status == 2, ended.printed
             assert "No space left on device" in ended.printed, ended.printed
             self.checked()
             check_whole(self.folder)

@@ -15,7 +15,6 @@ import model
 from cloning.network.network import Network
 from cloning.recordings.check import check_images
 from cloning.recordings.log import read_recording
-from cloning.training.distributed import Ranks
 from cloning.training.gpu import GpuFrames
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, shade
@@ -26,25 +25,18 @@ from model import REPORT, ROBUST, Generator, balance, split
 from tools.bench_training import one_by_one
 
 
+def all_rows(found):
+    return Observations.of_rows(found, np.arange(len(found)), found.steering, Lanes.unknown(len(found)))
+
+
 def observations(steering, recordings=None, frame=None):
-    n = len(steering)
-    recordings = recordings or [recording(n)]
-    which = np.repeat(np.arange(len(recordings)), [len(r) for r in recordings])
-    return Observations(
-        recordings,
-        which,
-        np.concatenate([np.arange(len(r), dtype=np.int32) for r in recordings]),
-        np.asarray(steering, np.float32),
-        np.arange(n, dtype=np.uint64) if frame is None else frame,
-        np.concatenate([r.time for r in recordings]),
-        Lanes.unknown(n),
-    )
+    found = Observations.of_recordings([all_rows(each) for each in recordings or [recording(len(steering))]])
+    frame = np.arange(len(found), dtype=np.uint64) if frame is None else frame
+    return found.take(slice(None), steering=np.asarray(steering, np.float32), frame=frame)
 
 
 def loaded(folder):
-    found = check_images(read_recording(folder))
-    n = len(found)
-    return Observations.of_rows(found, np.arange(n), found.steering, Lanes.unknown(n))
+    return all_rows(check_images(read_recording(folder)))
 
 
 @pytest.fixture(scope="module")
@@ -207,18 +199,6 @@ def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator):
     errors = SquaredErrors(network, torch.float32, generator.pool)(some)
     predicted = network(torch.from_numpy(some.images)).detach().numpy()
     assert errors.item() == pytest.approx(float(((predicted - some.labels) ** 2).sum()), rel=1e-4)
-
-
-def test_two_ranks_make_the_batch_that_one_process_makes(generator):
-    whole = generator.start_batch(7)()
-    of_ranks = [
-        Generator(generator.observations, REPORT, 0, generator.pool, ranks=Ranks(rank, world=2)) for rank in (0, 1)
-    ]
-    shares = [each.start_batch(7)() for each in of_ranks]
-    assert [share.total for share in shares] == [whole.total] * 2
-    for name in ("images", "labels", "keep"):
-        both = np.concatenate([getattr(share, name) for share in shares])
-        assert sorted(map(bytes, both)) == sorted(map(bytes, getattr(whole, name)))
 
 
 def test_an_augmentation_of_no_share_is_not_made(generator):

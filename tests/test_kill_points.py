@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import ROOT
+from commands import ROOT, TINY
 from drive_process import ask, awaited
 from kill_points import Watched
 from killed import ALL, KILLED, Trial, check_whole, chosen, spread, writes
@@ -28,8 +28,6 @@ from cloning.recordings.log import read_recording
 from tools.simulator_client import Simulator, telemetry
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks a process that has loaded its libraries")
-
-TINY = ("--samples-per-epoch", 20, "--batch-size", 8, "--device", "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,7 @@ def lake(tmp_path_factory) -> Path:
 def trained(lake, tmp_path_factory) -> Path:
     """The folder of a finished run of one epoch with seed 0, and the cache of checked images; not to be changed."""
     folder = tmp_path_factory.mktemp("earlier") / "trial"
-    Trial(folder, training(lake, "--epochs", 1)).whole_run()
+    Trial(folder, training(lake)).whole_run()
     return folder
 
 
@@ -57,9 +55,9 @@ def training(lake: Path, *arguments) -> list:
 
 
 def test_training_killed_anywhere_and_on_a_full_disk(lake, tmp_path):
-    trial = Trial(tmp_path / "trial", training(lake, "--epochs", 1), more=("--resume",))
+    trial = Trial(tmp_path / "trial", training(lake), more=("--resume",))
     trial.killed_everywhere(2)
-    trial.disk_full_everywhere(2, status=2)
+    trial.disk_full_everywhere(2)
 
 
 def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
@@ -69,7 +67,7 @@ def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
 def test_a_report_killed_anywhere_and_on_a_full_disk(trained, tmp_path):
     trial = Trial(tmp_path / "trial", ["-m", "cloning.report", "."], trained)
     trial.killed_everywhere(1)
-    trial.disk_full_everywhere(1, status=2)
+    trial.disk_full_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -204,8 +202,7 @@ def saved(folder: Path) -> list[bytes]:
 def test_driving_killed_anywhere(driving, jpegs):
     """The frames that are there are whole, video.py films them, and the next drive deletes them all."""
     trial, car = driving
-    trial.restore()
-    points = trial.run(trial.command).points
+    _, points = trial.whole_run()
     for number in chosen(points, 4):
         trial.restore()
         assert trial.run(trial.command, kill=number).status == KILLED
@@ -225,8 +222,7 @@ def test_driving_killed_anywhere(driving, jpegs):
 def test_driving_on_a_full_disk(driving, jpegs):
     """All frames are answered; those that are lost are counted, in the session's summary and at the end."""
     trial, car = driving
-    trial.restore()
-    points = trial.run(trial.command).points
+    _, points = trial.whole_run()
     for number in writes(points, 2):
         trial.restore()
         ended = trial.run(trial.command, full=number)
@@ -344,7 +340,7 @@ def converting(tmp_path, request):
 
 def test_a_data_set_and_a_recording_of_one_killed_anywhere_and_on_a_full_disk(converting):
     converting.killed_everywhere(1)
-    converting.disk_full_everywhere(1, status=2)
+    converting.disk_full_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -381,14 +377,14 @@ def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(tmp_path):
         trial = Trial(tmp_path / "trial", command)
         trial.killed_everywhere(1)
         trial.killed_at_every_length("film.mp4", 20 if ALL else 1)
-        trial.disk_full_everywhere(1, status=2)
+        trial.disk_full_everywhere(1)
 
 
 def test_writing_a_launcher_killed_anywhere_and_on_a_full_disk(tmp_path):
     command = ["-m", "simulator", "join", "--dialect", "roads", "--launcher", "sim.x86_64"]
     trial = Trial(tmp_path / "trial", command)
     trial.killed_everywhere(3)
-    trial.disk_full_everywhere(1, status=2)
+    trial.disk_full_everywhere(1)
 
 
 def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path):
@@ -397,4 +393,4 @@ def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path)
     trial = Trial(tmp_path / "trial", command)
     trial.killed_everywhere(1)
     trial.killed_at_every_length("replay.mp4", 20 if ALL else 1)
-    trial.disk_full_everywhere(1, status=2)
+    trial.disk_full_everywhere(1)

@@ -14,10 +14,9 @@ from test_recordings import SPACED, usual
 
 from cloning.base.errors import RecordingError
 from cloning.recordings import rows
+from cloning.recordings.format import CAMERAS, NUMBERS
 from cloning.recordings.log import read_recording
 
-CAMERAS = ("center", "left", "right")
-NUMBERS = ("steering", "throttle", "brake", "speed")
 HEADER_NAMES = {
     "center": ["center", "Center", "camera_center", "ct_path", "centre image", "img_center"],
     "left": ["left", "Left", "camera_left", "lt_path"],

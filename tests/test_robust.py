@@ -303,22 +303,12 @@ def test_shadows_darken_parts_of_some_images():
     assert blue > 1.2 * red  # the sky lights the shade
 
 
-def test_a_pose_with_a_shadow_is_seen_in_it(monkeypatch):
-    many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(200, 100))
-    poses = many.sample_poses(ROBUST, np.random.default_rng(0), np.zeros(200, bool))
-    grey = np.full((90, 320, 4), 150, np.uint8)
-    views = np.stack([poses.view(at, lambda camera, earlier: grey) for at in range(200)])
-    shaded = np.ptp(views, axis=(1, 2)).max(1) > 20  # of 150 in each colour
-    assert not shaded[poses.shade < 0].any()
-    assert shaded[poses.shade >= 0].mean() > 0.9  # a shadow may be faint
-
-
 @pytest.mark.parametrize("repeats", [1, 4, 36])
 def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
     def part(folder):
         rows = np.arange(50)
         known = lanes(monkeypatch, 0.05).take(rows + 50)
-        return Observations([without_files(50, folder)], np.zeros(50, int), rows, rows * 0.0, rows, rows * 1.0, known)
+        return Observations.of_rows(without_files(50, folder), rows, rows * 0.0, known)
 
     both = Observations.of_recordings([part("plain"), part("bend-repetitive")])
     recipe = replace(ROBUST, repeats=repeats)
@@ -329,9 +319,8 @@ def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
 def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
     many = lanes(monkeypatch, 0.4)
     both = Lanes.joined([Lanes.unknown(2000), many.take(np.full(2000, 100))])
-    n, rows = len(both), np.full(len(both), 100, np.int32)
-    labels, frames = both.steering(both.offset, both.yaw), np.arange(len(both), dtype=np.uint64)
-    everything = Observations([recording(0.4)], np.zeros(n, int), rows, labels, frames, rows, both)
+    n, labels = len(both), both.steering(both.offset, both.yaw)
+    everything = Observations.of_rows(recording(0.4), np.full(n, 100), labels, both)
     turn = sample_bends_more(everything, ROBUST, np.random.default_rng(0))
     assert len(turn) == n
     expected = both.weights(ROBUST.straight_weight)[2000:].sum()  # of the rows in a bend

@@ -63,17 +63,15 @@ def cut_rows(
     names, centres: as `Recording` has them: bytes (m,), sorted; int32 (n,), an index into names for each row.
     Raises RecordingError for an image that no row has, and for a stretch whose end comes before its beginning.
     """
-    path, order = folder / file, np.argsort(centres, kind="stable")
-    ends = np.searchsorted(centres, np.arange(len(names) + 1), sorter=order)  # of each image's rows in that order
-    has_copies = len(centres) > np.count_nonzero(np.diff(ends))
+    path, has_copies = folder / file, (np.bincount(centres) > 1).any()
     for cut in cuts:
         where = f"{path}: line {cut.line}" if cut.line else str(path)
         found = []
         for name in (cut.first, cut.last):
             at = int(np.searchsorted(names, os.fsencode(name)))
             is_there = (names[at : at + 1] == os.fsencode(name)).any()
-            found.append(order[ends[at] : ends[at + 1]] if is_there else order[:0])
-            if not len(found[-1]):
+            found.append(np.flatnonzero(centres == at))
+            if not is_there or not len(found[-1]):
                 raise RecordingError(
                     f"{where}: {name} is not the centre image of a usable row of {DRIVING_LOG}; name another one, or "
                     "delete the line"
