@@ -400,7 +400,8 @@ def prepare(command: Command) -> Prepared:
     observations = read_observations(run.recipe, folders, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)
     training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
-    print(summary.sizes(len(train), len(training), len(validation)))
+    resampled = f"{len(train):,} rows, {len(training):,} observations after resampling"
+    print(f"\ntraining: {resampled}; validation: {len(validation):,} rows\n")
     if not len(training):
         raise RecordingError("resampling has left out all rows for training, straight driving; record more")
     return Prepared(run, training, observations.take(validation), begin)

@@ -26,17 +26,18 @@ def check_folders(*paths: str | None, read: Iterable[str | Path | None] = ()) ->
     It would if it is one of the files that are read, or another output.
     """
     inputs = [each for each in read if each and os.path.exists(each)]
-    names = Counter(os.path.realpath(path) for path in paths if path)
-    for path in paths:
-        if path and names[os.path.realpath(path)] > 1:
+    outputs = [path for path in paths if path]
+    names = Counter(map(os.path.realpath, outputs))
+    for path in outputs:
+        if names[os.path.realpath(path)] > 1:
             raise OutputError(f"{path}: is named for two outputs, and one would replace the other; name another file")
-        if path and os.path.exists(path) and any(os.path.samefile(path, each) for each in inputs):
+        if os.path.exists(path) and any(os.path.samefile(path, each) for each in inputs):
             raise OutputError(f"{path}: is read, and would be replaced; name another file")
-        if path and not Path(path).absolute().parent.is_dir():
+        if not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
-        if path and names_folder(path):
+        if names_folder(path):
             raise OutputError(f"{path}: is a folder; name a file in it")
-        if path and Path(path).exists() and not Path(path).is_file():
+        if Path(path).exists() and not Path(path).is_file():
             raise OutputError(f"{path}: is a device or a pipe; name a file")
 
 

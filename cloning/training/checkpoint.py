@@ -111,7 +111,6 @@ class Progress:
 class SavedRun(NamedTuple):
     """A checkpoint of a run, which is to be continued."""
 
-    path: Path
     run: Run
     progress: Progress
     contents: dict[str, Any]  # of the file, of which network and optimizer are not looked at yet
@@ -136,7 +135,7 @@ def read_saved_run(path: Path, recipes: Mapping[str, Recipe]) -> SavedRun:
     if "training" not in contents:
         raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
     try:
-        return SavedRun(path, _saved_run(contents, recipes), _progress(contents), contents)
+        return SavedRun(_saved_run(contents, recipes), _progress(contents), contents)
     except ValueError as error:
         raise _unusable(path, error) from None
 
@@ -346,12 +345,12 @@ class Checkpoint:
             return Progress()
         state, self.resumed = begin.contents["training"], True
         if state.get("fingerprint") not in self.fingerprints:
-            raise ModelError(f"{begin.path}: the run began with other recordings; restore them, or {NEW_RUN}")
+            raise ModelError(f"{self.files.resume}: the run began with other recordings; restore them, or {NEW_RUN}")
         try:
             _restore_network(self.network, begin.contents)
             self._restore_optimizer(state.get("optimizer"), has_begun=begin.progress.number > 0)
         except ValueError as error:
-            raise _unusable(begin.path, error) from None
+            raise _unusable(self.files.resume, error) from None
         return begin.progress
 
     def _restore_optimizer(self, saved: object, has_begun: bool) -> None:

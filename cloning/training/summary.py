@@ -79,12 +79,6 @@ def recordings_table(counts: list[Counts], dropped: str) -> str:
     return "\n".join(lines)
 
 
-def sizes(rows: int, observations: int, validation: int) -> str:
-    """Return the numbers of rows for training, of observations made from them, and of rows for validation."""
-    resampled = f"training: {rows:,} rows, {observations:,} observations after resampling"
-    return f"\n{resampled}; validation: {validation:,} rows\n"
-
-
 def refuse_rejected(recordings: Iterable[Recording]) -> None:
     """Raise RecordingError if a recording has unusable rows."""
     if rejected := _rejected(recordings):
