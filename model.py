@@ -207,13 +207,13 @@ class Generator:
         recipe: Recipe,
         seed: int,
         pool: ThreadPoolExecutor,
-        ahead: int = 1,
         first: int = 0,
         ranks: Ranks | None = None,
     ):
-        """pool: makes the images; ahead: number of batches that are made at the same time; first: the next batch."""
+        """pool: makes the images; first: the next batch."""
         self.observations, self.recipe, self.seed, self.pool = observations, recipe, seed, pool
-        self.ahead, self.ranks = ahead, ranks or Ranks()
+        # Batches made at the same time; only one on a GPU, in this thread, which makes it while the GPU computes.
+        self.ahead, self.ranks = 1 if observations.gpu else 2, ranks or Ranks()
         self.numbers, self.started = itertools.count(first), deque[Callable[[], Batch]]()
         self.order = functools.lru_cache(2)(lambda n: recipe.order(observations, recipe, default_rng([seed, 2, n])))
 
@@ -286,12 +286,11 @@ class TrainingRun:
         self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, recipe.huber)
         if ranks.world > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
-        self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
+        self.predict = functools.partial(predict, precision=self.precision, pool=self.pool)
         self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
         self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprints(training, validation))
-        # Only one batch ahead on a GPU, in this thread, which makes it while the GPU computes.
-        self.progress, ahead = self.checkpoint.restore(begin), 1 if self.training.gpu else 2
-        self.generator = Generator(self.training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
+        self.progress = self.checkpoint.restore(begin)
+        self.generator = Generator(self.training, recipe, run.seed, self.pool, self.progress.number, ranks)
         self.validation_sets = recipe.validation_sets(self.validation, recipe, run.seed)
         self.held_out = held_out(validation.recordings, validation.recording, validation.row, aim)
         self.pace, self.stop, self.saved_at = summary.Pace(recipe, ranks.first), StopSignals(), time.monotonic()

@@ -180,7 +180,7 @@ def test_the_benchmarks_batch_is_the_generators(generator):
 
 def test_a_batch_depends_on_seed_and_number_alone(generator):
     third = generator.start_batch(3)()
-    resumed = Generator(generator.observations, REPORT, 0, generator.pool, ahead=2, first=2)
+    resumed = Generator(generator.observations, REPORT, 0, generator.pool, first=2)
     resumed.next_batch()
     again = resumed.next_batch()
     assert third.keep is not None and again.keep is not None

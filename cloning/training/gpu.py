@@ -7,7 +7,7 @@ uint8 (n, rows, columns, 3), RGB, on the GPU; choices are NumPy's arrays, as for
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -73,21 +73,13 @@ class GpuViews:
         self.pixels = to_device(np.stack([x, y, np.ones_like(x)]).astype(np.float32), device)
         self.make = Graphed(self._make)
 
-    def __call__(
-        self,
-        road: torch.Tensor,
-        earlier: torch.Tensor,
-        warps: np.ndarray,
-        mirrored: np.ndarray,
-        colours: np.ndarray,
-        shade: np.ndarray,
-    ) -> torch.Tensor:
-        """Return n views: uint8 (n, 75, 320, 3).
+    def __call__(self, road: torch.Tensor, earlier: torch.Tensor, poses: Any) -> torch.Tensor:
+        """Return n views: uint8 (n, 75, 320, 3); poses: `lanes.Poses`.
 
-        road, earlier: uint8 (n, 90, 320, 3), `ROAD_ROWS` of a pose's own and earlier frame; others: of `lanes.Poses`.
+        road, earlier: uint8 (n, 90, 320, 3), `ROAD_ROWS` of a pose's own and earlier frame.
         """
-        to_frames = np.linalg.inv(warps).reshape(-1, 36)
-        packed = np.concatenate([to_frames, colours.reshape(-1, 9), mirrored[:, None], shade[:, None]], axis=1)
+        columns = np.linalg.inv(poses.warps), poses.colours, poses.mirrored, poses.shade
+        packed = np.concatenate([column.reshape(len(poses), -1) for column in columns], axis=1)
         return self.make(road, earlier, to_device(packed.astype(np.float32), road.device))[0]
 
     def _make(self, road: torch.Tensor, earlier: torch.Tensor, packed: torch.Tensor) -> list[torch.Tensor]:

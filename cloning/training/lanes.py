@@ -161,8 +161,7 @@ class Poses(Table):
 
         road, earlier: uint8 (n, 90, 320, 3), the `ROAD_ROWS` of the camera's frame in each row and in the earlier one.
         """
-        make = _views_on(road.device)
-        return make(road, earlier, self.warps, self.mirrored, self.colours, self.shade)
+        return _views_on(road.device)(road, earlier, self)
 
     def title(self, at: int) -> str:
         """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""

@@ -207,17 +207,13 @@ class SquaredErrors(nn.Module):
 
 
 def predict(
-    network: nn.Module,
-    images: Callable[[np.ndarray], Any],
-    rows: np.ndarray,
-    device: torch.device,
-    precision: torch.dtype,
-    pool: Executor,
+    network: nn.Module, images: Callable[[np.ndarray], Any], rows: np.ndarray, precision: torch.dtype, pool: Executor
 ) -> np.ndarray:
     """Return the network's steering for these observations: float32 (len(rows),).
 
     rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads do it on a CPU.
     """
+    device = next(network.parameters()).device
 
     def part(chosen: np.ndarray) -> np.ndarray:
         with torch.inference_mode(), in_precision(precision, device):
