@@ -23,6 +23,8 @@ GPU_PIECE = 512  # images at most that a GPU predicts together
 GPU_SIZES = 16  # of batches on a GPU are multiples of this, because each size is recorded: see Graphed
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 
+Part = tuple[Tensor, Tensor, Tensor | None]  # some images of a batch, their labels, and the units that are kept
+
 
 @dataclass
 class Batch:
@@ -33,7 +35,7 @@ class Batch:
     keep: np.ndarray | None  # bool (n, units): the units of the flattened layer that dropout keeps; None: all
     total: int  # images in the whole batch, of all processes
 
-    def part(self, piece: slice) -> tuple[Tensor, Tensor, Tensor | None]:
+    def part(self, piece: slice) -> Part:
         """Return some images, their labels, and the units that are kept."""
         keep = None if self.keep is None else torch.from_numpy(self.keep[piece])
         return torch.as_tensor(self.images[piece]), torch.from_numpy(self.labels[piece]), keep
@@ -90,19 +92,14 @@ def start_batch(
 
 
 def squared_errors(
-    network: Callable[..., Tensor],
-    images: Tensor,
-    labels: Tensor,
-    keep: Tensor | None,
-    huber: float | None = None,
-    real: Tensor | None = None,
+    network: Callable[..., Tensor], part: Part, huber: float | None, real: Tensor | None = None
 ) -> Tensor:
     """Return the sum over the images of (predicted - label)², a scalar, float32.
 
-    images, labels, keep: as in Batch; real: float32 (n,), 0 for an image that does not count, else 1; huber: error
-    beyond which the gradient is that of Huber's loss, which grows linearly; None: at no error. The value
-    is the squared errors' nevertheless.
+    huber: error beyond which the gradient is that of Huber's loss, which grows linearly; None: at no error. The value
+    is the squared errors' nevertheless. real: float32 (n,), 0 for an image that does not count, else 1.
     """
+    images, labels, keep = part
     error = network(images, keep) - labels
     if real is not None:
         error = error * real
@@ -154,8 +151,8 @@ class SquaredErrors(nn.Module):
         meanwhile()
         images, labels, keep = batch.part(slice(None))
         with in_precision(self.precision, self.device):
-            keep = None if keep is None else keep.to(self.device)
-            return squared_errors(self.network, images.to(self.device), labels.to(self.device), keep, self.huber)
+            part = images.to(self.device), labels.to(self.device), None if keep is None else keep.to(self.device)
+            return squared_errors(self.network, part, self.huber)
 
     def on_gpu(self, batch: Batch) -> tuple[Tensor, list[Tensor]]:
         """Return the sum and its gradients; images that do not count fill the batch up to one of a few sizes."""
@@ -178,7 +175,7 @@ class SquaredErrors(nn.Module):
             return torch.func.functional_call(self.network, weights, inputs)
 
         with torch.enable_grad(), in_precision(self.precision, self.device):
-            total = squared_errors(network, images, labels, keep, self.huber, real)
+            total = squared_errors(network, (images, labels, keep), self.huber, real)
             return [total.detach(), *torch.autograd.grad(total, list(weights.values()))]
 
     def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[Tensor, list[Tensor]]:
@@ -193,8 +190,7 @@ class SquaredErrors(nn.Module):
 
         def compute(part: slice) -> tuple[Tensor, tuple[Tensor, ...]]:
             with torch.enable_grad():
-                images, labels, keep = batch.part(part)
-                errors = squared_errors(network, images, labels, keep, self.huber)
+                errors = squared_errors(network, batch.part(part), self.huber)
             return errors.detach(), torch.autograd.grad(errors, weights)
 
         done = self.pool.map(compute, pieces(len(batch.labels)))
