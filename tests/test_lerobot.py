@@ -352,6 +352,11 @@ def test_images_of_two_sources_without_dates_have_different_names(tmp_path):
     assert len(one) == len(two) == 3 and not one & two
 
 
+def test_the_middle_of_an_image_that_is_a_pixel_wide_is_a_pixel(tmp_path):
+    sample = Sample(0.0, [np.zeros((160, 1, 3), np.uint8)], {"steering": 0.0})
+    assert write_recording(iter([sample]), tmp_path / "one", 1.0, Counter()) == 1
+
+
 def test_a_recording_without_images_is_left_out(recordings, tmp_path):
     (tmp_path / "bare").mkdir()
     shutil.copy(recordings[0] / "driving_log.csv", tmp_path / "bare")

@@ -114,7 +114,7 @@ def fit(image: np.ndarray, notes: Counter[str]) -> np.ndarray:
     rows, columns, _ = image.shape
     if (rows, columns) == FRAME[:2]:
         return image
-    height, width = min(rows, columns * FRAME[0] // FRAME[1]), min(columns, rows * FRAME[1] // FRAME[0])
+    height, width = min(rows, max(1, columns * FRAME[0] // FRAME[1])), min(columns, rows * FRAME[1] // FRAME[0])
     notes[f"of images of {columns}x{rows} pixels the middle {width}x{height} are scaled to {FRAME[1]}x{FRAME[0]}"] += 1
     top, left = (rows - height) // 2, (columns - width) // 2
     middle = image[top : top + height, left : left + width]
