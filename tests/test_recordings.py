@@ -215,6 +215,12 @@ def test_decimal_commas_of_four_numbers_may_be_three_that_all_have_one(log):
     np.testing.assert_array_equal(numbers(found), np.array([(0.3, 0, 0, 30.1875), (0, 1, 0, 30.19)], np.float32))
 
 
+def test_decimal_commas_are_none_where_no_digits_are_surely_a_fraction(log):
+    """0 | 1 | 0 | 30,19, or five columns."""
+    with pytest.raises(RecordingError, match=r"line 1: '0,1,0,30,19' may be .* in 1 way, or more columns; write"):
+        log(*usual(numbers=["0,1,0,30,19", "0,1,0,29,5"]))
+
+
 def test_decimal_commas_of_a_car_that_stands_still(log):
     """An exponent has one digit before its point: 8,888892E-05 is no speed of 888892E-05 after a brake of 0,8."""
     found = log(*usual(numbers=["0,25,1,0,9,5625", "0,0,0,8,888892E-05"]))
