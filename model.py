@@ -46,7 +46,7 @@ from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
-from cloning.training.checkpoint import Begin, Checkpoint, SavedRun, fingerprints, resumed
+from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprints, resumed
 from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
@@ -256,12 +256,12 @@ class Generator:
 
 
 class Prepared(NamedTuple):
-    """A run, its observations, and with what it begins."""
+    """A run, its observations, and with what it begins: None for random weights."""
 
     run: Run
     training: Observations
     validation: Observations
-    begin: Begin
+    begin: SavedRun | FirstWeights | None
 
 
 class TrainingRun:

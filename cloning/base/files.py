@@ -72,6 +72,7 @@ def locked(folder: Path) -> Iterator[bool | None]:
     else:  # not after it: mypy would report that as never reached
         opened = os.open(folder, os.O_RDONLY)
         _locked.add(opened)
+        _close_in_forks()
         free: bool | None = True
         try:
             try:
@@ -85,14 +86,15 @@ def locked(folder: Path) -> Iterator[bool | None]:
                 os.close(opened)
 
 
-def _let_go() -> None:
+@functools.cache  # once
+def _close_in_forks() -> None:
     """Let a forked process hold none of the folders that this one has locked: it may end later, as after a kill."""
-    while _locked:
-        os.close(_locked.pop())
 
+    def close() -> None:
+        while _locked:
+            os.close(_locked.pop())
 
-if sys.platform != "win32":
-    os.register_at_fork(after_in_child=_let_go)
+    os.register_at_fork(after_in_child=close)
 
 
 def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:

@@ -116,17 +116,20 @@ class SavedRun(NamedTuple):
     contents: dict[str, Any]  # of the file, of which network and optimizer are not looked at yet
 
 
-Begin = SavedRun | dict[str, Any] | None  # of a run: as it was saved; weights, of `read_first_weights`; random weights
+class FirstWeights(NamedTuple):
+    """The weights with which a new run begins."""
+
+    contents: dict[str, Any]  # of the model file, which fit this program's network
 
 
-def read_first_weights(path: str, recipe: Recipe) -> dict[str, Any]:
-    """Return what a model file has of its network, which fits the recipe's. Raises ModelError."""
+def read_first_weights(path: str, recipe: Recipe) -> FirstWeights:
+    """Return the weights of a model file, which the recipe's network can have. Raises ModelError."""
     saved = load_checkpoint(path, "name a model file of model.py")
     try:
         _restore_network(NETWORKS[recipe.network](), saved)
     except ValueError as error:
         raise ModelError(f"{path}: its contents do not fit this program: {error}; name another model file") from None
-    return {name: saved[name] for name in ("layers", PREPROCESSING, "network") if name in saved}
+    return FirstWeights({name: saved[name] for name in ("layers", PREPROCESSING, "network") if name in saved})
 
 
 def read_saved_run(path: Path, recipes: Mapping[str, Recipe]) -> SavedRun:
@@ -140,8 +143,8 @@ def read_saved_run(path: Path, recipes: Mapping[str, Recipe]) -> SavedRun:
         raise _unusable(path, error) from None
 
 
-def resumed(command: Command) -> tuple[Run, Begin]:
-    """Return the run that a command is about, and with what it begins.
+def resumed(command: Command) -> tuple[Run, SavedRun | FirstWeights | None]:
+    """Return the run that a command is about, and with what it begins, if not with random weights.
 
     A run that is resumed has the arguments of its checkpoint, where they are not given. Raises ModelError.
     """
@@ -334,13 +337,13 @@ class Checkpoint:
         }
         write(self.files.progress, json.dumps(position).encode())
 
-    def restore(self, begin: Begin) -> Progress:
+    def restore(self, begin: SavedRun | FirstWeights | None) -> Progress:
         """Load weights and, of a saved run, the optimizer's state, and return the run's progress.
 
         Raises ModelError if the run was trained on other data.
         """
-        if isinstance(begin, dict):
-            _restore_network(self.network, begin)
+        if isinstance(begin, FirstWeights):
+            _restore_network(self.network, begin.contents)
         if not isinstance(begin, SavedRun):
             return Progress()
         state, self.resumed = begin.contents["training"], True
