@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from cloning.road.generated import MARKINGS, generate
-from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import __main__ as simulator
-from simulator import report
 from simulator.expert import Expert
 from simulator.run import Run
 from simulator.scenery.generated import LANDS, Terrain, weather
@@ -113,20 +111,6 @@ def test_a_number_gives_the_same_road_in_every_process_and_on_every_machine():
     assert road.points[[0, 300]] == pytest.approx(pinned, abs=2e-4)
 
 
-@pytest.mark.parametrize("direction", ["ccw", "cw"])
-def test_a_track_of_a_generated_road_lies_where_the_road_does(direction):
-    road, track = generated("road-3"), Track("road-3", direction)
-    assert (track.name, track.direction, Track("road-3").direction) == ("road-3", direction, "ccw")
-    assert np.all(track.edges == road.width / 2)
-    assert track.points[0] == pytest.approx(road.points[0], abs=1e-6)
-    distance = np.linalg.norm(road.points[:, None] - track.points, axis=2).min(axis=1)
-    assert distance.max() < 0.55  # the track's points are 1 m apart
-    turned = -track.curvature.sum() * track.step
-    assert turned == pytest.approx(2 * np.pi if direction == "ccw" else -2 * np.pi, rel=1e-9)
-    assert np.abs(track.curvature).max() < 1 / 12
-    assert set(track.starts) == {"training", "autonomous"}
-
-
 @pytest.mark.parametrize("name", NO_ROADS)
 @pytest.mark.parametrize("command", [["record", "x"], ["drive"], ["window"]])
 def test_a_road_that_does_not_exist_is_a_clear_error(command, name, capsys, tmp_path, monkeypatch):
@@ -134,20 +118,6 @@ def test_a_road_that_does_not_exist_is_a_clear_error(command, name, capsys, tmp_
     assert simulator.main([*command, "--track", name]) == 2
     assert f"python: {name}: there is no such track; there are lake, jungle, road-1" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("name", "direction"), [("road-3", "cw"), ("road-5", "ccw")])
-def test_expert_drives_a_lap_of_a_generated_road(name, direction):
-    """Both have bends of less than 15 m radius and grades of more than 0.15; road-3 is 6.3 m wide."""
-    run = Run(Track(name, direction))
-    assert np.abs(run.track.curvature).max() > 1 / 15
-    assert np.abs(run.track.grade).max() > 0.15
-    expert = Expert(run.track, seed=3, top_speed=15 * MPH)
-    run.car.speed_limit = 15 * MPH
-    while not run.laps:
-        run.step(*expert.drive(run))
-    assert not run.departures
-    assert report.lap_report(run)["track"] == name
 
 
 @pytest.mark.parametrize("number", range(1, 6))

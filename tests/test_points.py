@@ -36,6 +36,7 @@ def test_a_circle_is_measured_as_a_circle():
     assert np.all(track.edges == 3.5)
     assert make_road(CIRCLE, width=np.int64(7)) == make_road(CIRCLE, width=np.float32(7)) == track.source
     assert Track(make_road(CIRCLE[::-1])).direction == "cw"
+    assert Track(track.source, "cw").points[0] == pytest.approx(track.points[0]), "a loop's first point remains it"
     assert Track(make_road(CIRCLE[:-1], closed=True)).length == pytest.approx(track.length)
 
 

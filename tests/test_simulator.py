@@ -162,11 +162,13 @@ def test_a_departure_is_noted_and_the_car_set_back():
     assert lap_report(run)["autonomy"] == pytest.approx(1 - 6 / run.time, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["lake", "jungle"])
+@pytest.mark.parametrize(("name", "mph"), [("lake", 30), ("jungle", 30), ("road-3", 15), ("road-5", 15)])
 @pytest.mark.parametrize("direction", ["ccw", "cw"])
-def test_expert_drives_a_lap_on_the_road(name, direction):
+def test_expert_drives_a_lap_on_the_road(name, mph, direction):
+    """The generated roads have bends of less than 15 m radius and grades of more than 0.15; road-3 is 6.3 m wide."""
     run = Run(Track(name, direction))
-    expert, in_bends = Expert(run.track, seed=3), []
+    run.car.speed_limit = mph * MPH
+    expert, in_bends = Expert(run.track, seed=3, top_speed=mph * MPH), []
     while not run.laps:
         steering, throttle = expert.drive(run)
         if abs(run.track.curvature[run.track.index(run.s)]) > 1 / 60:  # of less than 60 m radius
@@ -175,6 +177,7 @@ def test_expert_drives_a_lap_on_the_road(name, direction):
     assert not run.departures
     assert np.abs(run.trajectory.offset).max() < 2.5
     assert np.mean(np.array(in_bends) == 0) < 0.01
+    assert lap_report(run)["track"] == name
 
 
 def test_numbers_are_written_as_the_simulators():
