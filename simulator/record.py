@@ -35,10 +35,6 @@ def _cameras(view: _View) -> Cameras:
     return Cameras(Scene.of(source, look), disturbance=disturbance, seed=seed)
 
 
-def _prepare(view: _View) -> None:
-    _cameras(view)
-
-
 def _render(view: _View, transform: TransformState, begins: bool) -> list[bytes]:
     """Return the three cameras' JPEGs, perhaps the first of a drive; runs in a rendering process."""
     cameras = _cameras(view)
@@ -88,8 +84,6 @@ def record(
     with ExitStack() as stack:
         recording = stack.enter_context(RecordingWriter(folder, start_of(seed, *what)))
         pool = stack.enter_context(started_workers(renderers))
-        for _ in range(renderers):
-            pool.submit(_prepare, view)
         bar = stack.enter_context(progress_bar(round(laps * track.length), "m"))
         begins = True  # whether the next row is the first of a drive, before which no frame was seen
 

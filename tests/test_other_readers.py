@@ -91,7 +91,6 @@ def test_the_films_of_a_data_set_can_be_cut_into_episodes_without_decoding_them(
 def test_images_of_several_recordings_fit_into_one_folder(tmp_path, monkeypatch):
     """Where programs copy them, after `cat */driving_log.csv`: no name of the simulator's, a time, is there twice."""
     monkeypatch.setattr(record, "started_workers", Here)
-    monkeypatch.setattr(record, "_prepare", lambda view: None)
     monkeypatch.setattr(record, "_render", lambda view, transform, begins: [b"image"] * 3)
 
     def names(folder: str, direction: str, **options) -> list[str]:
