@@ -282,21 +282,16 @@ class Episodes(Dialect):
     apart = True
 
     def __init__(self, stage: Stage):
-        self.day, self._last = True, None  # data of the last action
-        self.tone: np.ndarray | None = None  # of the camera by day
         super().__init__(stage)
-        self.ready = False
+        self.day, self.ready = True, False
         self.events: list[dict[str, str]] = []  # of this episode, as the program knows them
+        self._last: Any = None  # data of the last action
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
         """Return the scenery in its weather, and the same in the colours of its segments."""
-        built = super().build(source)
-        return [*built, segments(built[0])]
-
-    def open(self, source: str | PointRoad, direction: str | None = None) -> None:
-        """Build a track in its weather, and set the car at its start. Raises TrackError."""
-        super().open(source, direction)
-        self.tone = self.views[0].scene.scenery.tone
+        (built,) = super().build(source)
+        self.tone = built.tone  # of the camera by day
+        return [built, segments(built)]
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, start or end an episode, pause or go on. Raises UserError for an unknown track or weather."""
