@@ -1,9 +1,9 @@
 """The autonomous mode: the car sends its centre camera's frames and drives as the server answers."""
 
-import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Literal
 
 from tqdm import tqdm
@@ -165,8 +165,7 @@ class RemoteDriver(Driven):
         self.address, self.cameras = (host, port), cameras
         self.connection: Connection | None = None
         self.state, self.next_try = "waiting for drive.py", 0.0
-        self._connecting: threading.Thread | None = None
-        self._connected: queue.SimpleQueue[Connection | ConnectionLost] = queue.SimpleQueue()  # by the thread
+        self._connecting: Future[Connection] | None = None  # of the thread
 
     def poll(self, by_hand: bool, run: Run) -> None:
         """Use the answers that have arrived, without waiting, and send a telemetry for each.
@@ -193,27 +192,24 @@ class RemoteDriver(Driven):
 
     def _connect(self, run: Run) -> Connection | None:
         """Return a connection that the thread has made, or None; start the thread if it is time."""
-        if self._connecting is None:
-            if time.monotonic() >= self.next_try:
-                # A daemon, so that it does not keep a closed window's process.
-                self._connecting = threading.Thread(target=self._open_connection, daemon=True)
-                self._connecting.start()
+        if self._connecting is None and time.monotonic() >= self.next_try:
+            self._connecting = Future()
+            # A daemon, so that it does not keep a closed window's process.
+            threading.Thread(target=self._open_connection, args=[self._connecting], daemon=True).start()
+        if self._connecting is None or not self._connecting.done():
             return None
-        if self._connected.empty():
-            return None
-        self._connecting, made = None, self._connected.get()
-        if isinstance(made, ConnectionLost):
-            raise made
+        opened, self._connecting = self._connecting, None
+        made = opened.result()
         self.connection, self.state = made, "drive.py drives"
         for _ in range(OPENS):
             made.send(current_telemetry(run, self.cameras, 0.0, 0.0))
         return made
 
-    def _open_connection(self) -> None:
+    def _open_connection(self, opened: Future[Connection]) -> None:
         try:
-            self._connected.put(Connection(*self.address, real_timing=True, send_timeout=WINDOW_SEND_TIMEOUT))
+            opened.set_result(Connection(*self.address, real_timing=True, send_timeout=WINDOW_SEND_TIMEOUT))
         except ConnectionLost as error:
-            self._connected.put(error)
+            opened.set_exception(error)
 
     def close(self) -> None:
         """Close the connection, if one is open."""

@@ -57,10 +57,6 @@ class AwaitedDriver:
         else:
             self.takes += 0.2 * (min(seconds, 0.2) - self.takes)
 
-    def changed(self) -> None:
-        """Learn that a telemetry's first answer was another than before."""
-        self.constant = 0
-
     def kept_silent(self, is_new: bool) -> None:
         """Learn from a vain wait; is_new: for the answer to a telemetry whose first answer was another than before."""
         self.constant += 1
@@ -169,7 +165,7 @@ class Joined(ClientSession):
         """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
         driver, is_new = self.driver, not self.dialect.same
         if is_new:
-            driver.changed()
+            driver.constant = 0
         longest = driver.longest()
         if self.dialect.still or not longest:
             return
