@@ -112,5 +112,5 @@ def water(rng: Generator, palette: Palette) -> Mesh:
     """Return the lake's surface."""
     side = np.linspace(-760, 760, 27)
     points = np.stack(np.meshgrid(side, side, WATER_LEVEL), axis=-1)[:, :, 0]
-    texture = textures.grey(0.97, 0.02 * textures.noise(rng, (64, 64), 3))
+    texture = textures.grey(0.97, 0.02 * textures.noise(rng, 64, 3))
     return sheet(points, palette["water"], points[..., :2] / 40, texture)

@@ -15,16 +15,16 @@ from simulator.scenery.shapes import Colour
 ASPHALT_LEVEL = 0.72  # mean of the asphalt's texture, 0..1
 
 
-def noise(rng: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
-    """Return Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
-    grain, edge = rng.standard_normal(shape).astype(np.float32), int(3 * blur) + 1
+def noise(rng: Generator, size: int, blur: float) -> np.ndarray:
+    """Return square Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
+    grain, edge = rng.standard_normal((size, size)).astype(np.float32), int(3 * blur) + 1
     smooth: np.ndarray = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
     return smooth / smooth.std()
 
 
 def clouds(rng: Generator, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:
     """Return noise of mean 0 and variance 1 in octaves, each half as coarse and half as strong as the one before."""
-    total = np.sum([noise(rng, (size, size), coarsest / 2**k) / 2**k for k in range(octaves)], axis=0)
+    total = np.sum([noise(rng, size, coarsest / 2**k) / 2**k for k in range(octaves)], axis=0)
     return (total - total.mean()) / total.std()
 
 
@@ -36,13 +36,13 @@ def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
 
 def asphalt(rng: Generator, size: int = 512, grain: float = 0.15, spots: float = 1.0) -> np.ndarray:
     """Return asphalt; grain and spots scale the contrast of its fine and its coarse structure."""
-    stones = noise(rng, (size, size), 0.8)
+    stones = noise(rng, size, 0.8)
     return grey(
         ASPHALT_LEVEL,
         grain * stones,
-        spots * 0.12 * np.maximum(noise(rng, (size, size), 0.9) - 1, 0),
-        spots * 0.06 * noise(rng, (size, size), 6),
-        spots * 0.03 * noise(rng, (size, size), 40),
+        spots * 0.12 * np.maximum(noise(rng, size, 0.9) - 1, 0),
+        spots * 0.06 * noise(rng, size, 6),
+        spots * 0.03 * noise(rng, size, 40),
     )
 
 
@@ -71,7 +71,7 @@ def paint_lines(texture: np.ndarray, colour: Colour, half_width: float, lines: S
 
 def concrete(rng: Generator, size: int = 128) -> np.ndarray:
     """Return a concrete slab with the joint to the next."""
-    texture = grey(0.90, 0.02 * noise(rng, (size, size), 1.5), 0.03 * noise(rng, (size, size), 20))
+    texture = grey(0.90, 0.02 * noise(rng, size, 1.5), 0.03 * noise(rng, size, 20))
     texture[:2] = 160  # the joint
     return texture
 
@@ -90,7 +90,7 @@ def plain() -> np.ndarray:
 
 def soil(rng: Generator, size: int = 256) -> np.ndarray:
     """Return a texture for soil and grass."""
-    return grey(0.80, 0.07 * clouds(rng, size, 24), 0.05 * noise(rng, (size, size), 0.8))
+    return grey(0.80, 0.07 * clouds(rng, size, 24), 0.05 * noise(rng, size, 0.8))
 
 
 def rock(rng: Generator, size: int = 256, streak: float = 6.0) -> np.ndarray:
@@ -104,14 +104,14 @@ def rock(rng: Generator, size: int = 256, streak: float = 6.0) -> np.ndarray:
 def cobbles(rng: Generator, size: int = 512, stones: int = 12) -> np.ndarray:
     """Return irregular cobbles with pale joints, longer along the road (rows) than across it."""
     rows, columns = np.mgrid[0:size, 0:size].astype(np.float32)
-    rows += 7 * noise(rng, (size, size), 18)
-    columns += 5 * noise(rng, (size, size), 18)
+    rows += 7 * noise(rng, size, 18)
+    columns += 5 * noise(rng, size, 18)
     across = columns / size * stones
     course = np.floor(across)
     along = rows / size * stones * 0.6 + 0.37 * course
     edge = np.minimum(np.minimum(across % 1, 1 - across % 1), np.minimum(along % 1, 1 - along % 1) / 0.6)
     tint = rng.uniform(-0.13, 0.10, (64, 64))[course.astype(int) % 64, np.floor(along).astype(int) % 64]
-    level = 0.76 + tint + 0.09 * noise(rng, (size, size), 1.5)
+    level = 0.76 + tint + 0.09 * noise(rng, size, 1.5)
     level = np.where(edge < 0.08, 0.95, level)
     return grey(0.0, level)
 
