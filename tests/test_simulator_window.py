@@ -14,7 +14,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from commands import HERE, python
+from commands import HERE, ROOT
 from drive_process import awaited
 from panda3d.core import GamepadButton, InputDevice
 
@@ -174,6 +174,12 @@ def test_the_f310s_buttons_act_once_a_press():
     assert controls.set_speed == 30 - 6 + 2
     press(controls, pad, device, GamepadButton.face_a(), *[GamepadButton.dpad_up()] * 40)
     assert (controls.set_speed, controls.throttle) == (30, 0.4)
+
+
+def python(*words, env, cwd=ROOT):
+    """This Python; not a warm one, whose panda3d knows only the screen that was named when it was loaded."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, timeout=60)
 
 
 @pytest.fixture
