@@ -85,7 +85,6 @@ class Dialect(Driven):
 
     def show(self) -> None:
         """Let the telemetry's images show the track in its weather from now on. Raises TrackError."""
-        self.disturbance = self.stage.disturbance or FALLING.get(self.weather)
         for i, built in enumerate(self.build(self.track.source)):
             if i < len(self.views):
                 self.views[i].move(Scene(built))
@@ -96,7 +95,7 @@ class Dialect(Driven):
     def begin_frames(self) -> None:
         """Let the next frame be drawn anew, as the first of a drive."""
         self.seen = -1.0  # simulated s at the last frame
-        self.views[0].disturb(self.disturbance)
+        self.views[0].disturb(self.stage.disturbance or FALLING.get(self.weather))
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
         """Return what the telemetry's images show. Raises TrackError for an unknown weather."""
