@@ -1,15 +1,14 @@
 """The command `python -m simulator replay`: a model drives real recordings."""
 
 import argparse
+import contextlib
 import functools
 import multiprocessing
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Self
 
 import cv2
 
@@ -136,7 +135,7 @@ def drive_at_limits(
     return [drives[limit] for limit in limits]
 
 
-class ForkedDrives:
+class ForkedDrives(contextlib.ExitStack):
     """Drives that go on in forked processes, one each: in threads, they would wait for one another's Python code.
 
     It is a context, at whose end none of them runs any more.
@@ -144,8 +143,8 @@ class ForkedDrives:
 
     def __init__(self, drives: dict[float, Drive]):
         """drives: by their limits; each that was started is replaced when it has ended."""
+        super().__init__()
         self.drives = drives
-        self.processes: list[BaseProcess] = []
         self.pending: list[Connection] = []  # where results will come from
 
     def start(self, line: LineDrive, drives: Sequence[Drive]) -> None:
@@ -156,18 +155,10 @@ class ForkedDrives:
             with starting():
                 process = context.Process(target=_go_on, args=(line, done, sender), daemon=True)
                 process.start()
-                self.processes.append(process)
+                self.callback(process.join)
+                self.callback(process.terminate)  # first
             sender.close()
             self.pending.append(receiver)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            process.join()
 
     def collect(self, timeout: float | None) -> None:
         """Take the results that have come, and wait for the others: for the next one so many seconds, None: for all.
