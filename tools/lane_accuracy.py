@@ -42,13 +42,6 @@ EDGES_LOOK = 700  # plus a road's number: its look
 NEAR = 0.3  # m: a reading no further from the truth is good
 
 
-def unseen_courses() -> list[tuple[str, int]]:
-    """Return tracks and looks, first without shadows, then with."""
-    plain = [(name, look) for name in ROADS for look in UNSEEN_LOOKS]
-    plain += [(road, 990 + k) for k, road in enumerate(UNSEEN_ROADS)]
-    return plain + [(name, shadowed(look)) for name, look in plain]
-
-
 @contextmanager
 def rendered_drive(track: Track, laps: float, speed: float, look: int) -> Iterator[tuple[Recording, np.ndarray]]:
     """Record a drive of the expert; give it, and the true lateral offsets, float64 (n,), m. speed: mph."""
@@ -61,7 +54,9 @@ def rendered_drive(track: Track, laps: float, speed: float, look: int) -> Iterat
 
 def measure_drives(network: LaneNetwork, laps: float) -> None:
     """Print the errors on recordings of the stand-in simulator, which logs the true position."""
-    for name, look in unseen_courses():
+    plain = [(name, look) for name in ROADS for look in UNSEEN_LOOKS]
+    plain += [(road, 990 + k) for k, road in enumerate(UNSEEN_ROADS)]
+    for name, look in plain + [(name, shadowed(look)) for name, look in plain]:
         with rendered_drive(Track(name), laps, 30 if name == "lake" else 15, look) as (recording, true):
             position = fuse_detections(recording, detect_centres(recording, network))
             located = estimate_lane_position(recording, stretches(recording), network)

@@ -231,26 +231,21 @@ class BatchSampler:
 # Training
 
 
-def transform(centres: torch.Tensor, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Convert a first camera's lane centres, (n, 5), to m right and m ahead of a second camera, (n, 5) each.
+def consistency_loss(first: torch.Tensor, second: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+    """Return the loss of two cameras' detections, float32 (n, 5), for their differences where both see the lane.
 
     poses: float32 (n, 4), of the second camera relative to the first, see `Pose`.
     """
-    right, forward, yaw = poses[:, :3].split(1, dim=1)
-    across, along = centres - right, torch.from_numpy(DISTANCES_AHEAD) - forward
-    return across * yaw.cos() - along * yaw.sin(), across * yaw.sin() + along * yaw.cos()
-
-
-def consistency_loss(first: torch.Tensor, second: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-    """Return the loss of two cameras' detections, float32 (n, 5), for their differences where both see the lane."""
-    right, ahead = transform(first, poses)
-    ahead = ahead.detach()
     distances = torch.from_numpy(DISTANCES_AHEAD)
+    to_right, forward, yaw, furthest = poses.split(1, dim=1)
+    across, along = first - to_right, distances - forward
+    # Where the first camera detects the centre, seen from the second one
+    right = across * yaw.cos() - along * yaw.sin()
+    ahead = (across * yaw.sin() + along * yaw.cos()).detach()
     after = torch.bucketize(ahead, distances).clamp(1, len(DISTANCES_AHEAD) - 1)
     part = (ahead - distances[after - 1]) / (distances[after] - distances[after - 1])
     there = second.gather(1, after - 1) * (1 - part) + second.gather(1, after) * part
-    nearest, furthest = DISTANCES_AHEAD[0] - 0.6, float(DISTANCES_AHEAD[-1]) + 0.6
-    common = (ahead > nearest) & (ahead < torch.clamp(poses[:, 3:], max=furthest))
+    common = (ahead > DISTANCES_AHEAD[0] - 0.6) & (ahead < furthest.clamp(max=float(DISTANCES_AHEAD[-1]) + 0.6))
     return masked_loss(there, torch.where(common, right, torch.nan))
 
 

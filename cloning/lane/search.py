@@ -72,18 +72,14 @@ class Part:
         """Return where on the track the car is in a row of the stretch, or in the nearest one of the part, m."""
         return float(self.found.states[min(max(row, self.start), self.end - 1) - self.start, ALONG])
 
-    def overlaps(self, other: "Part") -> bool:
-        """Return whether the parts have rows in common."""
-        return self.stretch == other.stretch and self.start < other.end and other.start < self.end
-
     def away_from(self, other: "Part", axis: int) -> float:
         """Return how far from here another part is placed in the rows of both, on average, m.
 
         axis: ALONG or ACROSS the road; inf on another track or in its other direction, or without a common row.
         """
-        if self.track != other.track or not self.overlaps(other):
-            return np.inf
         start, end = max(self.start, other.start), min(self.end, other.end)
+        if (self.track, self.stretch) != (other.track, other.stretch) or start >= end:
+            return np.inf
         here, there = (part.found.states[start - part.start : end - part.start, axis] for part in (self, other))
         return float(np.abs(here - there).mean())
 
