@@ -57,9 +57,6 @@ class TrackFilter:
             self.noise[near_line > 0.5] *= BESIDE_LINE
             self.noise = np.concatenate([self.noise, np.tile(MARKING_NOISE, (len(stretch), 1))], axis=1)
 
-    def __len__(self) -> int:
-        return len(self.measured)
-
     def backwards(self) -> "TrackFilter":
         """Return the filter that follows the stretch from its last row to its first."""
         turned = copy.copy(self)

@@ -123,19 +123,13 @@ class Signs:
         if not len(self.usual):
             self.usual = now
         self.usual = now + kept[0] * (self.usual - now)
-        signs = np.concatenate(
-            [
-                np.abs(now),
-                np.abs(observed.centres + observed.mirrored),
-                np.abs(now - self.usual),
-                [
-                    abs(observed.steering - centres @ self.ordinary.steering),
-                    self.ordinary.activations.distance(observed.activations),
-                    self.ordinary.hidden.distance(observed.hidden),
-                ],
-            ]
-        )
-        signs = np.log(signs + LEAST)
+        unlike_mirrored, changed = np.abs(observed.centres + observed.mirrored), np.abs(now - self.usual)
+        unusual = [
+            abs(observed.steering - centres @ self.ordinary.steering),
+            self.ordinary.activations.distance(observed.activations),
+            self.ordinary.hidden.distance(observed.hidden),
+        ]
+        signs = np.log(np.concatenate([np.abs(now), unlike_mirrored, changed, unusual]) + LEAST)
         if not len(self.means):
             self.means = np.tile(signs, (len(MEAN_TIMES), 1))
         self.means, self.time = signs + kept[:, None] * (self.means - signs), time
