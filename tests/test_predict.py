@@ -3,8 +3,6 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ import drive as drive_py
 from cloning.base.frame import FRAME
 from cloning.lane.predict import FOR_HEADING, FOR_OFFSET, LONGEST_PAUSE, Predictor
 from cloning.lane.recovery import MAX_LABEL_OFFSET
-from cloning.network.network import SHIPPED_MODEL, Network
+from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.images import encode
 from cloning.recordings.log import read_recording
 from cloning.replay import replay
@@ -26,12 +24,10 @@ from cloning.wire.client import telemetry_packet
 from cloning.wire.protocol import Place
 from simulator.driving import Conditions, drive
 
-SPEED, PAUSE = TOP_SPEED_MPH * MPH, 1 / 15  # m/s, s between frames
+SPEED, PAUSE, SECONDS = TOP_SPEED_MPH * MPH, 1 / 15, 40  # m/s, s between frames, s of a drive
 
 
-def corrected(
-    predictor: Predictor, steering: float | np.floating, frame: np.ndarray, time: float, speed: float
-) -> np.float32:
+def corrected(predictor, steering, frame, time, speed):
     """Return the steering for where the car is, at the next frame."""
     predictor.move(time, speed)
     return predictor.correct(steering, frame)
@@ -72,14 +68,14 @@ class World:
         self.metres += step
 
 
-def drive_with(late: int, lost: float, predictor: Predictor | None, seconds: float = 40) -> list[float]:
+def drive_with(late, lost, predictor):
     """Drive with frames that come so many frames late, or a share of which is lost; return the offsets, m.
 
     The times that the predictor is told are wrong by some 5 ms, as those of a server that looks at its clock.
     """
     world, shown, rng = World(), deque[tuple[np.ndarray, float]](maxlen=late + 1), np.random.default_rng(1)
     offsets, noise = [], np.random.default_rng(2)
-    for number in range(round(seconds / PAUSE)):
+    for number in range(round(SECONDS / PAUSE)):
         if not number or rng.random() >= lost:
             shown.append((world.frame(), world.steering()))
         frame, steering = shown[0]
@@ -89,7 +85,7 @@ def drive_with(late: int, lost: float, predictor: Predictor | None, seconds: flo
     return offsets
 
 
-def test_frames_in_time_change_nothing() -> None:
+def test_frames_in_time_change_nothing():
     """The network's own number is sent, bit for bit."""
     world, predictor = World(), Predictor()
     for number in range(300):
@@ -100,7 +96,7 @@ def test_frames_in_time_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("late, weaves", [(2, 1.2), (3, 2.5), (5, 5)])
-def test_late_frames(late: int, weaves: float) -> None:
+def test_late_frames(late, weaves):
     """The delay is found, and the car keeps to the lane, beside which it weaves so many m without a prediction."""
     predictor = Predictor()
     predicted, alone = drive_with(late, 0, predictor), drive_with(late, 0, None)
@@ -108,23 +104,23 @@ def test_late_frames(late: int, weaves: float) -> None:
     assert max(predicted[300:]) < 0.2 * weaves and max(alone[300:]) > weaves
 
 
-def test_lost_frames() -> None:
+def test_lost_frames():
     """Where most frames are lost, the car stays nearer to the lane's centre."""
     predicted, alone = drive_with(0, 0.8, predictor := Predictor()), drive_with(0, 0.8, None)
     assert predictor.delay.frames == 0
     assert np.mean(predicted) < 0.5 * np.mean(alone)
 
 
-def test_a_car_that_stands_is_steered_as_the_network_says() -> None:
+def test_a_car_that_stands_is_steered_as_the_network_says():
     """Repeated frames of a car at rest, as the simulator sends them at the start, change nothing."""
     predictor, frame = Predictor(), World().frame()
     assert {float(corrected(predictor, 0.25, frame, number * PAUSE, 0.0)) for number in range(50)} == {0.25}
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 7])
-def test_frames_that_recur_are_no_late_or_lost_ones(frames: int) -> None:
+def test_frames_that_recur_are_no_late_or_lost_ones(frames):
     """A program that sends a few frames again and again, at any speed, gets the network's own numbers."""
-    world, seen, predictor = World(), list[tuple[np.ndarray, np.float32]](), Predictor()
+    world, seen, predictor = World(), [], Predictor()
     for _ in range(frames):
         seen.append((world.frame(), np.float32(world.steering())))
         world.move(float(seen[-1][1]))
@@ -133,7 +129,7 @@ def test_frames_that_recur_are_no_late_or_lost_ones(frames: int) -> None:
         assert corrected(predictor, steering, frame.copy(), number * PAUSE, SPEED) == steering
 
 
-def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_harm() -> None:
+def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_harm():
     """Whatever is told of the speed, the steering is a number of -1..1, and nothing grows."""
     predictor = Predictor()
     drive_with(0, 0.8, predictor)
@@ -146,7 +142,7 @@ def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_ha
 
 
 @pytest.mark.parametrize("pause", [LONGEST_PAUSE + 0.1, -5.0])
-def test_a_pause_begins_anew(pause: float) -> None:
+def test_a_pause_begins_anew(pause):
     """What the car did before a pause of the simulator, or a time that runs backwards, is forgotten."""
     predictor = Predictor()
     drive_with(4, 0, predictor)
@@ -156,7 +152,7 @@ def test_a_pause_begins_anew(pause: float) -> None:
     assert (predictor.delay.frames, len(predictor.since), predictor.pose) == (0, 0, (0.0, 0.0))
 
 
-def test_telemetries_of_the_same_time_are_no_pause() -> None:
+def test_telemetries_of_the_same_time_are_no_pause():
     """The stand-in sends several between two physics steps, which show the same: the delay is found nevertheless."""
     predictor, world, shown = Predictor(), World(), deque[tuple[np.ndarray, float]](maxlen=4)
     for number in range(600):
@@ -168,7 +164,7 @@ def test_telemetries_of_the_same_time_are_no_pause() -> None:
             assert predictor.delay.frames == 6 and abs(world.offset) < 0.1
 
 
-def test_no_delay_is_seen_without_a_background() -> None:
+def test_no_delay_is_seen_without_a_background():
     """Frames of one colour, or of noise, tell nothing."""
     rng = np.random.default_rng(0)
     for frames in (np.zeros((100, *FRAME), np.uint8), rng.integers(0, 255, (100, *FRAME), np.uint8)):
@@ -179,20 +175,18 @@ def test_no_delay_is_seen_without_a_background() -> None:
 
 
 @pytest.mark.parametrize("disturbance", ["late:5", "dropped:4"])
-def test_the_shipped_network_stays_on_the_road(disturbance: str) -> None:
+def test_the_shipped_network_stays_on_the_road(disturbance):
     """At 30 mph on the lake, with frames 0.4 s late, or with three of four lost."""
     conditions = Conditions(str(SHIPPED_MODEL), 30, 1, "ccw", 250, (300.0, 0.0, 0.0))
     driven = drive(conditions._replace(disturbance=Disturbance.parse(disturbance)), "lake")
     assert (driven.ended, driven.farthest < 1.5) == ("arrived", True)
 
 
-def test_a_disturbed_replay_is_corrected_in_each_stretch_anew(
-    sample_recording: Path, network: Network, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disturbed_replay_is_corrected_in_each_stretch_anew(sample_recording, network, monkeypatch):
     """What the pilot steers counts; frames as they were recorded are in time."""
     recording, pilots = read_recording(sample_recording), []
 
-    def pilot(steer: object) -> Callable[..., tuple[np.float32, None]]:
+    def pilot(steer):
         pilots.append(steer)
         return lambda frame, time, speed: (np.float32(0.25), None)
 
@@ -205,7 +199,7 @@ def test_a_disturbed_replay_is_corrected_in_each_stretch_anew(
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
-def test_a_real_recording_is_driven_with_late_frames() -> None:
+def test_a_real_recording_is_driven_with_late_frames():
     """A lake at 30 mph, with frames 0.3 s late, needs no intervention."""
     recording = read_recording(next(each for each in real_recordings.FOLDERS if "lake" in each.name)).take(slice(600))
     lines = replay.reference_lines(recording)
@@ -213,15 +207,10 @@ def test_a_real_recording_is_driven_with_late_frames() -> None:
     assert not driven.interventions and np.abs(driven.offset).mean() < 0.4
 
 
-def test_drive_py_tells_once_how_late_frames_are(
-    network: Network, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_drive_py_tells_once_how_late_frames_are(network, monkeypatch, caplog):
     """What is sent is the corrected steering, and a line says why."""
-    world, shown, session = (
-        World(),
-        deque[tuple[np.ndarray, float]](maxlen=5),
-        drive_py.Session(drive_py.DriveServer(network)),
-    )
+    world, shown = World(), deque[tuple[np.ndarray, float]](maxlen=5)
+    session = drive_py.Session(drive_py.DriveServer(network))
     monkeypatch.setattr(drive_py, "steer", lambda network, frame: np.float32(shown[0][1]))
 
     def steered(time: float) -> float:
@@ -238,7 +227,7 @@ def test_drive_py_tells_once_how_late_frames_are(
     assert caplog.messages == [*told, "frames are no longer known to come late"]
 
 
-def test_drive_py_tells_frames_apart_that_come_within_a_tick(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_py_tells_frames_apart_that_come_within_a_tick(network, monkeypatch):
     """As on Windows, where time.monotonic() may stand still for 15.6 ms, in which a car at 30 mph drives 0.2 m."""
     monkeypatch.setattr(drive_py.time, "monotonic", lambda: 1000.0)
     world, session = World(), drive_py.DriveServer(network).session("sid")
