@@ -15,9 +15,12 @@ import warm
 from browser import chromium
 from commands import SHORT, finished_run
 from rendered import render_frame, render_recording
+from scenes import recorded
 
 from cloning.network.network import Network, load_model, save_model
 from cloning.recordings.images import decode
+from cloning.recordings.log import Recording
+from cloning.road.track import Track
 from simulator import scenery
 
 
@@ -83,6 +86,12 @@ def longest_file():
 def sample_recording(tmp_path_factory) -> Path:
     """A recording of 60 rows; not to be changed."""
     return render_recording(tmp_path_factory.mktemp("data") / "lake sample")
+
+
+@pytest.fixture(scope="session")
+def lake_drive(tmp_path_factory) -> tuple[Recording, np.ndarray]:
+    """A drive on the lake, and the true lateral offset of each row, m; not to be changed."""
+    return recorded(tmp_path_factory.mktemp("recorded") / "lake", Track("lake"), 0.12, 30)
 
 
 @pytest.fixture

@@ -55,12 +55,6 @@ def recorded(
     return recording, np.array(run.trajectory.offset)[steps]
 
 
-@functools.cache
-def lake_drive(session: Path) -> tuple[Recording, np.ndarray]:
-    """A drive on the lake, recorded once in pytest's folder, not to be changed; see `recorded`."""
-    return recorded(session / "recorded" / "lake", Track("lake"), 0.12, 30)
-
-
 def load(path: str | Path) -> np.ndarray:
     """A picture in a file: uint8, BGR."""
     picture = cv2.imread(str(path))

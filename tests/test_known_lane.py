@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import pytest
 from commands import TINY, refused, trained
-from scenes import lake_drive
 
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses
@@ -18,21 +17,14 @@ from cloning.road.motion import MPH, stretches
 HEADER = "center image,lateral offset (m),heading error (radians)\n"
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    """A recording's folder, and the offsets that the car really had at its rows."""
-    recording, true = lake_drive(tmp_path_factory.getbasetemp())
-    return recording.folder, true
-
-
 @pytest.fixture
-def lane(drive, tmp_path):
+def lane(lake_drive, tmp_path):
     """The lane.csv of a copy of the recording, with links to its images."""
-    folder = tmp_path / "lake"
+    source, folder = lake_drive[0].folder, tmp_path / "lake"
     folder.mkdir()
     for name in ("driving_log.csv", "lane.csv"):
-        shutil.copyfile(drive[0] / name, folder / name)
-    (folder / "IMG").symlink_to(drive[0] / "IMG")
+        shutil.copyfile(source / name, folder / name)
+    (folder / "IMG").symlink_to(source / "IMG")
     return folder / "lane.csv"
 
 
@@ -41,19 +33,19 @@ def known(folder):
     return lane_position(recording, stretches(recording))
 
 
-def test_the_simulator_tells_where_its_car_is(drive):
-    folder, true = drive
-    recording, position = read_recording(folder), known(folder)
+def test_the_simulator_tells_where_its_car_is(lake_drive):
+    recording, true = lake_drive
+    position = known(recording.folder)
     assert position.trusted.all()
     assert position.lateral_offset == pytest.approx(true, abs=1e-4)
     right = np.diff(true) / (np.diff(recording.time) * recording.speed[1:] * MPH)  # m for each metre driven
     assert np.corrcoef(position.heading_error[16:], right[15:])[0, 1] > 0.97  # measured: 0.99; at first it hardly rolls
-    (line,) = reference_lines(load_recording(folder))
+    (line,) = reference_lines(load_recording(recording.folder))
     assert line.is_lane_centre and line.offset == pytest.approx(position.lateral_offset[line.rows], abs=1e-6)
 
 
-def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(drive, lane, monkeypatch):
-    recording, (_, true), estimate = read_recording(lane.parent), drive, object()
+def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(lake_drive, lane, monkeypatch):
+    recording, (_, true), estimate = read_recording(lane.parent), lake_drive, object()
     result, stamp = analyse.lane(recording), analyses.stamp(lane.parent, analyses.LANE)
     assert result.column("offset", recording.images[:, 0]) == pytest.approx(true, abs=1e-4)
     lane.unlink()

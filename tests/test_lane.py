@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
-from scenes import Here, lake_drive, recorded
+from scenes import Here, recorded
 from test_parts import localised
 
 from cloning.base.errors import ModelError, OutputError, RecordingError
@@ -50,11 +50,6 @@ SHORT_TRAINING = ("--looks", "0", "--roads", "1", "--mountains", "0", "--frames"
 UNSEEN = 1003  # a look that the network was not trained on
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    return lake_drive(tmp_path_factory.getbasetemp())
-
-
 def test_a_strip_is_the_frames_road_at_half_the_resolution():
     frame = np.random.default_rng(0).integers(0, 100, FRAME).astype(np.uint8)
     pixel = STRIP_TO_FRAME @ (80, 16, 1)
@@ -79,9 +74,9 @@ def test_where_the_centre_lies_ahead(direction):
     assert found == pytest.approx(-1 / np.cos(yaw) - DISTANCES_AHEAD * np.tan(yaw), abs=0.04)
 
 
-def test_a_drive_is_localised_on_its_road(drive):
+def test_a_drive_is_localised_on_its_road(lake_drive):
     """By what the network sees, a quarter of it made nonsense."""
-    recording, true = drive
+    recording, true = lake_drive
     stretch = stretches(recording)[0]
     rows = stretch.rows
     centres = detect_centres(recording)[rows]
@@ -151,8 +146,8 @@ def test_mirrored_frames_mirror_the_position():
     assert mirrored == pytest.approx(-found, abs=0.02)  # two steps of bfloat16 at 3 m
 
 
-def test_a_rendered_drive(drive):
-    recording, true = drive
+def test_a_rendered_drive(lake_drive):
+    recording, true = lake_drive
     found = estimate_lane_position(recording, stretches(recording))
     assert isinstance(found, LanePosition) and found.lateral_offset.dtype == found.heading_error.dtype == np.float32
     assert found.lateral_offset.shape == found.heading_error.shape == found.trusted.shape == (len(recording),)
@@ -171,13 +166,13 @@ def test_a_road_that_no_network_was_trained_on(tmp_path):
     assert found.trusted.mean() > 0.95  # measured: 1
 
 
-def test_strips_are_those_of_the_rows_asked_for(drive):
-    assert np.array_equal(read_strips(drive[0], slice(5, 9)), read_strips(drive[0], slice(0, 10))[5:9])
+def test_strips_are_those_of_the_rows_asked_for(lake_drive):
+    assert np.array_equal(read_strips(lake_drive[0], slice(5, 9)), read_strips(lake_drive[0], slice(0, 10))[5:9])
 
 
-def test_cameras_and_rows_are_fused(drive):
+def test_cameras_and_rows_are_fused(lake_drive):
     """Perfect detections of a straight road from a car that drives along it, 0.7 m right of the centre."""
-    recording = copy.deepcopy(drive[0])
+    recording = copy.deepcopy(lake_drive[0])
     recording.steering[:], recording.speed[:] = 0, 30
     seen = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, len(DISTANCES_AHEAD)))
     found = fuse_detections(recording, seen.astype(np.float32))
@@ -191,12 +186,12 @@ def test_cameras_and_rows_are_fused(drive):
 
 @pytest.mark.parametrize("known", [0, 60])
 @pytest.mark.parametrize(("difference", "which"), [(0.5, 1), (0.05, 0)])
-def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, which, known, monkeypatch):
+def test_an_unknown_road_is_read_by_the_network_for_any_road(lake_drive, difference, which, known, monkeypatch):
     """Though the one for the tracks is trusted in more rows; where both agree, that one counts.
 
     It is all of the recording, or what follows a drive on a known track.
     """
-    recording = copy.deepcopy(drive[0])
+    recording = copy.deepcopy(lake_drive[0])
     recording.steering[:], recording.speed[:] = 0, 30
     recording.time[known:] += 100 * (known > 0)
     of_tracks = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, 5)).astype(np.float32)
@@ -220,8 +215,8 @@ def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, 
 
 @pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize("real", [False, *real_recordings.FOLDERS], ids=str)
-def test_images_with_red_and_blue_exchanged_are_told(drive, real, exchanged, tmp_path, capsys):
-    whole = read_recording(real) if real else drive[0]
+def test_images_with_red_and_blue_exchanged_are_told(lake_drive, real, exchanged, tmp_path, capsys):
+    whole = read_recording(real) if real else lake_drive[0]
     recording = whole.take(np.linspace(0, len(whole) - 1, SAMPLE).astype(int))  # the rows by which it is told
     changed = replace(recording, folder=tmp_path)
     (tmp_path / "IMG").mkdir()
@@ -295,9 +290,9 @@ def test_what_a_network_may_notice_of_a_frame_is_measured():
     assert (dark, saturation) == (0, 0) and edges == pytest.approx(100 / 30) and laplacian > 100
 
 
-def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
+def test_rendered_frames_are_like_themselves(lake_drive, tmp_path, monkeypatch, capsys):
     """The table of differences, of a rendered recording against the same places rendered again."""
-    recording, _ = drive
+    recording, _ = lake_drive
     monkeypatch.setattr("cloning.lane.parts.WINDOW", len(recording) // 2)  # the drive is short
     picture = tmp_path / "both.png"
     monkeypatch.setitem(parts.ANCHOR_TURN_RESIDUAL, "lake", ((0, 1), (0.5, 0.5)))
@@ -322,9 +317,9 @@ def test_a_training_without_any_road_is_refused(capsys):
     assert "are all 0: nothing to render" in capsys.readouterr().err
 
 
-def test_the_accuracy_on_a_recording_is_printed(drive, capsys):
+def test_the_accuracy_on_a_recording_is_printed(lake_drive, capsys):
     """The side cameras appear to be where they are mounted, and the car as far off the centre as it was driven."""
-    recording, true = drive
+    recording, true = lake_drive
     assert lane_accuracy.main(["--laps", "0", str(recording.folder)]) == 0
     printed = capsys.readouterr().out
     assert f"{len(recording)} rows" in printed
