@@ -47,19 +47,6 @@ LINE_ROUNDS = 3  # in each, the painted line is expected where the one before fo
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
 
 
-def line_deviations(expected: np.ndarray, stretch: Stretch, strips: Strips) -> np.ndarray:
-    """Return how far right of a stretch's expected centre line a painted one is found: float64 (n, 3), m.
-
-    expected: float64 (n, 2, k), of `TrackFilter.lines_at`, at `marking.AHEAD`. See `marking.find_lines`. Raises
-    RecordingError for unreadable images.
-    """
-    found = []
-    for start in range(0, len(expected), marking.ROWS_AT_ONCE):
-        part, first = expected[start : start + marking.ROWS_AT_ONCE], stretch.rows.start + start
-        found.append(marking.find_lines(strips(slice(first, first + len(part))), part))
-    return np.concatenate(found)
-
-
 def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarray, strips: Strips) -> Localisation:
     """Return the localisation of a stretch, corrected by the line that is painted along the track's centre.
 
@@ -69,8 +56,12 @@ def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarra
     for _ in range(LINE_ROUNDS):
         centre = follower.lines_at(localisation.states, np.r_[marking.AHEAD, marking.DISTANCES])
         expected, near = centre[..., : len(marking.AHEAD)], centre[:, 0, len(marking.AHEAD) :]
-        found = marking.supported(line_deviations(expected, stretch, strips))
-        follower = TrackFilter(stretch, centres, localisation.track, near + found)
+        found = []
+        for start in range(0, len(expected), marking.ROWS_AT_ONCE):
+            part, first = expected[start : start + marking.ROWS_AT_ONCE], stretch.rows.start + start
+            found.append(marking.find_lines(strips(slice(first, first + len(part))), part))
+        marks = near + marking.supported(np.concatenate(found))
+        follower = TrackFilter(stretch, centres, localisation.track, marks)
         again = Candidate(follower, localisation.states[0])
         again.follow(len(stretch), localisation.states)
         localisation = replace(localisation, states=again.smooth())
