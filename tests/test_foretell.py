@@ -18,8 +18,6 @@ from cloning.road.motion import MPH, TOP_SPEED_MPH
 from tools import foretell as tool
 from tools.simulator_client import telemetry
 
-JPEG = drive.page.encode(render_frame(0.3, 0.5, np.random.default_rng(0)), 90)
-
 
 def observations(rng: np.random.Generator, rows: int, strange: float) -> Observation:
     """What is seen in a drive, ordinary if nothing is strange; as in real ones, the steering follows the lane."""
@@ -265,21 +263,21 @@ def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, netw
 # drive.py
 
 
-def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_let_it_go_on(network, limits):
+def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_let_it_go_on(network, limits, jpegs):
     server = drive.DriveServer(network, 20, limits=limits, stop_when_lost=True)
     session, risks = server.session("sid"), [0.0]
     session.pilot.foretell = lambda *frame: (np.float32(0), risks[0])  # type: ignore[assignment]
 
     def set_speed(risk: float) -> float:
         risks[0] = risk
-        session.answer(telemetry(JPEG, speed="15.0000"))
+        session.answer(telemetry(jpegs[0], speed="15.0000"))
         assert session.history[-1].risk == risk
         return session.controller.set_speed
 
     assert [set_speed(risk) for risk in (0.1, ALARM, 0.6875, 0.86)] == [20, 20, 10, drive.SLOWEST_MPH]
     assert set_speed(0.2) == 20
     assert set_speed(0.9) == 0 and set_speed(0.1) == 0, "it stays where it is"
-    assert float(session.answer(telemetry(JPEG, speed="15.0000"))["throttle"]) == -1
+    assert float(session.answer(telemetry(jpegs[0], speed="15.0000"))["throttle"]) == -1
     assert drive.page.state_of(session, session.heard) == "doubtful"
     server.change_set_speed(12)
     assert set_speed(0.95) == 12 and drive.page.state_of(session, session.heard) == "driving", "at the person's risk"
@@ -288,10 +286,10 @@ def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_le
     assert set_speed(0.6) == 0, "a person's stop holds"
 
 
-def test_without_the_option_the_risk_is_only_shown(network, limits):
+def test_without_the_option_the_risk_is_only_shown(network, limits, jpegs):
     session = drive.DriveServer(network, 20, limits=limits._replace(bias=30.0)).session("sid")
-    session.answer(telemetry(JPEG, speed="15.0000"))
+    session.answer(telemetry(jpegs[0], speed="15.0000"))
     assert (session.history[-1].risk or 0) > 0.99 and session.controller.set_speed == 20
     unknown = drive.DriveServer(network, 20).session("sid")
-    unknown.answer(telemetry(JPEG, speed="15.0000"))
+    unknown.answer(telemetry(jpegs[0], speed="15.0000"))
     assert unknown.history[-1].risk is None

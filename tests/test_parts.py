@@ -138,13 +138,6 @@ def test_stretches_too_short_for_a_window_are_placed_together_or_if_long_enough_
     assert np.isnan(placed(other.take(short), seen[short])).all()
 
 
-def pieces(lake, *rows, pause=PAUSE):
-    """Rows of the drive on the lake, as (rows, pause) each after a pause of so many seconds."""
-    order, seconds = np.concatenate(rows), np.full(sum(map(len, rows)), PAUSE)
-    seconds[np.cumsum([len(each) for each in rows])[:-1]] = pause
-    return lake[0].take(order, time=np.cumsum(seconds)), lake[1][order]
-
-
 def plain(brightness):
     """Strips of one brightness in each row."""
     return lambda rows: np.tile(brightness[rows, None, None, None, None], (1, 3, 32, 160, 3))
@@ -171,7 +164,9 @@ def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
 @pytest.mark.parametrize(("rows", "unlike"), [(70, slice(0)), (180, slice(400, 500))])
 def test_a_stretch_that_fits_only_where_the_part_before_it_ends_is_another_road(lake, rows, unlike):
     """From the end of 70 rows there was no time to come back to where the lake goes on; of 180 only the start fits."""
-    recording, centres = pieces(lake, np.r_[0:320], np.r_[347 : 347 + rows], np.r_[320:640], pause=2.0)
+    order, pauses = np.r_[0:320, 347 : 347 + rows, 320:640], np.full(640 + rows, PAUSE)
+    pauses[[320, 320 + rows]] = 2.0
+    recording, centres = lake[0].take(order, time=np.cumsum(pauses)), lake[1][order]
     centres[unlike] = np.random.default_rng(1).uniform(-4, 4, centres[unlike].shape)
     foreign = np.r_[np.zeros(320, bool), np.ones(rows, bool), np.zeros(320, bool)]
     offset = placed(recording, centres)
