@@ -56,9 +56,6 @@ def split_at_cuts(
         starts = range(first, end, ROWS_AT_ONCE)
         pieces = [block_colours(strips(slice(start, min(start + ROWS_AT_ONCE, end)))) for start in starts]
         cuts = first + 1 + np.flatnonzero(find_cuts(np.concatenate(pieces)))
-        if not len(cuts):
-            whole.append(stretch)
-            continue
         edges = [first, *cuts.tolist(), end]
         rows = [slice(*each) for each in itertools.pairwise(edges) if each[1] - each[0] >= MIN_STRETCH_ROWS]
         whole += [Stretch.of(recording, each) for each in rows]

@@ -57,8 +57,6 @@ class LanePosition(Table):
         edges = np.flatnonzero(np.diff(piece)) + 1
         runs = itertools.pairwise([0, *edges.tolist(), len(piece)])
         kept = [(start, end) for start, end in runs if piece[start] != MISHAP and end - start >= MIN_STRETCH_ROWS]
-        if kept == [(0, len(piece))]:
-            return [stretch]
         return [Stretch.of(recording, slice(rows.start + start, rows.start + end)) for start, end in kept]
 
 

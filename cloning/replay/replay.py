@@ -136,7 +136,7 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
     for start, end in changes.reshape(-1, 2).tolist():
         if end - start >= MIN_STRETCH_ROWS:
             first, rows = stretch.rows.start, slice(start, end)
-            part = stretch if rows == slice(0, len(lane)) else Stretch.of(recording, slice(first + start, first + end))
+            part = Stretch.of(recording, slice(first + start, first + end))
             placed = int(lane.placed[rows].sum())
             lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, placed, ahead.take(rows)))
     return lines
