@@ -230,8 +230,7 @@ def main(argv: list[str] | None = None) -> int:
         for seed, way in enumerate(DIRECTIONS, 2 * at):  # so not every drive has its drops in the same place
             how = Conditions("", options.speeds[at], options.look, way, metres, set_back=True, seed=seed)
             courses.append((track, options.laps, how))
-    if options.recordings:
-        courses += [(str(folder), 0, Conditions("", 0, 0)) for folder in find_folders(options.recordings)]
+    courses += [(str(folder), 0, Conditions("", 0, 0)) for folder in find_folders(options.recordings)]
     if not courses:
         raise UserError("nothing to drive: name --tracks or --recordings")
     kinds, strengths = list(dict.fromkeys(options.kinds)), sorted(set(options.strengths))

@@ -166,9 +166,7 @@ class Placing:
     def spread(self, forward: bool) -> None:
         """Place what is left, from the ends of the parts that there are on, or from their starts back."""
         parts, self.parts = self.parts[:: 1 if forward else -1], []
-        if not parts:
-            return
-        for part, other in zip(parts, [*parts[1:], None], strict=True):
+        for part, other in zip(parts, [*parts[1:], None], strict=False):
             self.parts.append(part)
             while found := self.next_to(self.parts[-1], other, forward):
                 self.parts.append(found)
