@@ -79,7 +79,6 @@ def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (HEADER, "names no centre image of a usable row of driving_log.csv;"),
         (HEADER + "c.jpg,0,0\n", "names no centre image of a usable row of driving_log.csv;"),
         ("", "line 1: not center image,"),
         (HEADER + "c.jpg,0.5,0.1\nc.jpg,0.5\n", "line 3: 2 fields where 3 are expected"),

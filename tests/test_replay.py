@@ -296,7 +296,6 @@ def test_drives_that_never_part_are_driven_once(recording):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
         (["FOLDER", "--model", "MODEL", "--picture", "MODEL"], "is read, and would be replaced; name another file"),
         (["FOLDER", "--model", "MODEL", "--report", "LOG"], "driving_log.csv: is read, and would be replaced; name"),
         (["FOLDER", "--model", "MODEL", "--report", "x", "--film", "./x"], "x: is named for two outputs"),
