@@ -238,8 +238,8 @@ def digest_of(file: Path) -> str:
 
 def server_address(driver: str) -> tuple[str, int] | None:
     """Return the host and port that a driver is, None if it is a file or built in."""
-    match = re.fullmatch(r"([\w.-]+):(\d{1,5})", driver)
-    return (match[1], int(match[2])) if match and int(match[2]) <= MAX_PORT else None
+    match = re.fullmatch(r"([\w.-]+|\[[\da-fA-F:.]+\]):(\d{1,5})", driver)  # in brackets: an IPv6 address
+    return (match[1].strip("[]"), int(match[2])) if match and int(match[2]) <= MAX_PORT else None
 
 
 def workers_for(driver: str, processes: int, scheduler: str | None) -> AbstractContextManager[Executor]:

@@ -241,8 +241,9 @@ def test_its_page_is_read_on_a_phone(page, tmp_path):
     assert page.box("tbody th")[2] > 100, "not one letter below the other"
 
 
-def test_a_port_that_there_cannot_be_is_not_taken_for_another():
+def test_the_address_of_a_server_is_told_from_a_file():
     assert driving.server_address("127.0.0.1:65535") == ("127.0.0.1", 65535)
+    assert driving.server_address("[::1]:4567") == ("::1", 4567)
     with pytest.raises(UserError, match=r"127\.0\.0\.1:70103: no such file"):
         driving.workers_for("127.0.0.1:70103", 1, None)  # which a socket takes for 4567
 

@@ -1,7 +1,7 @@
 """Make the film at the top of README.md: a network drives both tracks, and what it looks at is shown in magenta.
 
-python -m tools.readme_film                     # the network that comes with the project
-python -m tools.readme_film model.pt film.webp  # another one, into another file
+    python -m tools.readme_film                     # the network that comes with the project
+    python -m tools.readme_film model.pt film.webp  # another one, into another file
 
 Left the car from behind, right what its camera sees: first on the lake, then in the jungle, without and with shadows,
 as the stand-in simulator renders them. The film is an animated WebP, which web pages show like a picture.
