@@ -18,6 +18,7 @@ from steer_server import unused_port
 
 import drive
 from cloning.base.errors import UserError
+from cloning.base.program import in_commands
 from cloning.network.network import SHIPPED_MODEL, load_model, steer
 from cloning.recordings.images import decode
 from tools.simulator_client import Simulator, telemetry
@@ -68,7 +69,7 @@ def test_other_socket_libraries_are_refused_by_the_command_and_no_harm_to_an_imp
     done = start([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout == f"{module == 'drive'}\n" and done.returncode == 2, done.stderr
     assert words in done.stderr and "Traceback" not in done.stderr
-    assert "`pip install .`" in done.stderr
+    assert in_commands("`pip install .`") in done.stderr
 
 
 def test_which_model_drives(jpegs, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from commands import HERE, ROOT, python
 
 from cloning.base import cores, progress
 from cloning.base.outputs import as_typed
-from cloning.base.program import FAILED
+from cloning.base.program import FAILED, in_commands
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
 
@@ -118,8 +118,20 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
     done = run(*command, modules=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
     activate = "" if program.startswith("behavioral-cloning") else "activate the environment"  # which is a clone's
-    assert f"{library} is missing: {activate}" in done.stderr and remedy in done.stderr
+    assert f"{library} is missing: {activate}" in done.stderr and in_commands(remedy) in done.stderr
     assert done.stderr.startswith(f"{program.split()[0]}")
+
+
+def test_a_missing_library_is_installed_where_the_command_finds_it(tmp_path, monkeypatch):
+    """The environments that uv and pipx make have no pip: that of the terminal would install it elsewhere."""
+    folder = tmp_path / "behavioral-cloning"
+    monkeypatch.setattr(sys, "prefix", str(folder))
+    assert in_commands("`pip install flask`") == "`pip install flask`"
+    folder.mkdir()
+    (folder / "pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.13.9\nversion_info = 3.11.7\n", encoding="utf-8")
+    assert in_commands("`pip install flask`") == f'`uv pip install --python "{folder}" flask`'
+    (folder / "pipx_metadata.json").touch()
+    assert in_commands("`pip install flask`") == "`pipx inject behavioral-cloning flask`"
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,19 @@ def in_commands(text: str) -> str:
     """Return a text with the commands as the user starts them: `behavioral-cloning drive` for `python drive.py`."""
     for clone, command in installed.items():
         text = text.replace(clone, command)
-    return text
+    return text.replace("pip install", _pip_install()) if "pip install" in text else text
+
+
+def _pip_install() -> str:
+    """Return `pip install` for this environment: those of pipx and uv have no pip, and any other installs elsewhere."""
+    if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")):
+        return f"pipx inject {os.path.basename(sys.prefix)}"
+    try:
+        with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as settings:
+            by_uv = "\nuv = " in settings.read()
+    except OSError:  # no virtual environment
+        by_uv = False
+    return f'uv pip install --python "{sys.prefix}"' if by_uv else "pip install"
 
 
 def failed(error: UserError | OSError | MemoryError) -> int:
@@ -101,7 +113,7 @@ def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType 
     if not installed:
         activate = f"activate the environment, in the project's folder (`{ACTIVATE}`)"
         remedy = f"{activate}; where that does not help, {remedy}"
-    print(f"{name}: the library {library} is missing: {remedy}", file=sys.stderr, flush=True)
+    print(in_commands(f"{name}: the library {library} is missing: {remedy}"), file=sys.stderr, flush=True)
     os._exit(FAILED)
 
 
