@@ -9,7 +9,7 @@
     frame, info = env.reset()
     terminated = truncated = False
     while not (terminated or truncated):
-        action = numpy.float32([steer(network, frame), 1.0])
+        action = numpy.array([steer(network, frame), 1.0], numpy.float32)
         frame, reward, terminated, truncated, info = env.step(action)
     print("left the road" if terminated else "drove a lap", info)
 
