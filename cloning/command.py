@@ -18,7 +18,7 @@ COMMANDS = {  # name: its module, the command of a clone, what it does
     "export": ("cloning.network.export", "python -m cloning.network.export", "write a network as ONNX"),
     "lerobot": ("cloning.lerobot.__main__", "python -m cloning.lerobot", "to and from data sets of LeRobot"),
 }
-USAGE = "usage: behavioral-cloning COMMAND ...\n\n" + "\n".join(
+USAGE = "usage: behavioral-cloning COMMAND ... | --version\n\n" + "\n".join(
     f"  {name:10} {does}: {clone}" for name, (_, clone, does) in COMMANDS.items()
 )
 
@@ -26,6 +26,11 @@ USAGE = "usage: behavioral-cloning COMMAND ...\n\n" + "\n".join(
 def main() -> None:
     """Run the command that the arguments name."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name == "--version":
+        from importlib.metadata import version  # here, because it takes 20 ms
+
+        print("behavioral-cloning", version("behavioral-cloning"))
+        sys.exit(program.DONE)
     if name not in COMMANDS:
         print(USAGE, file=sys.stdout if name in ("-h", "--help") else sys.stderr)
         sys.exit(program.DONE if name in ("-h", "--help") else program.FAILED)

@@ -79,6 +79,7 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
         return subprocess.run(words, cwd=elsewhere, capture_output=True, text=True, encoding="utf-8", timeout=120)
 
     assert run(command).returncode == 2
+    assert run(command, "--version").stdout == f"behavioral-cloning {wheel.name.split('-')[1]}\n"
     commands = re.findall(r"^  (\w+)", run(command, "--help").stdout, re.MULTILINE)
     assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "report", "export", "lerobot"]
     done = run(folder / "python", "-c", IN_PYTHON)
