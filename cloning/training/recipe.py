@@ -119,10 +119,14 @@ class Recipe:
     def __post_init__(self) -> None:
         """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain.
 
-        Raises ValueError for another `best_by`, which would be asked for only after an epoch.
+        Raises ValueError for a figure of another type, such as a rate for `dropout`, and for another `best_by`, which
+        would be asked for only after an epoch.
         """
         for item in fields(self):
-            object.__setattr__(self, item.name, _python(getattr(self, item.name)))
+            value = _python(getattr(self, item.name))
+            if item.type in (bool, int, float) and type(value) not in (item.type, int if item.type is float else None):
+                raise ValueError(f"{item.name} is {value!r}, not of type {item.type.__name__}")
+            object.__setattr__(self, item.name, value)
         if self.best_by not in ("val_loss", "val_drift"):
             raise ValueError(f"best_by is {self.best_by!r}, not 'val_loss' or 'val_drift'")
 
@@ -177,8 +181,8 @@ def option_name(name: str) -> str:
 
 
 def _python(value: Any) -> Any:
-    """Return NumPy's numbers as Python's, also those of a range, and anything else as it is."""
-    if type(value) is tuple or isinstance(value, np.ndarray):
+    """Return NumPy's numbers as Python's, also those of a range, lists as tuples, and anything else as it is."""
+    if type(value) in (tuple, list) or isinstance(value, np.ndarray):
         return tuple(map(_python, value))
     return value.item() if isinstance(value, np.generic) else value
 
