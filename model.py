@@ -31,14 +31,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import default_rng
-from torch import channels_last, manual_seed, nn
+from torch import channels_last, nn
 
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
 from cloning.base.outputs import as_typed
 from cloning.base.progress import progress_bar
-from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
+from cloning.network import compute
 from cloning.network.network import NETWORKS, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
@@ -272,14 +272,13 @@ class TrainingRun:
         run, training, validation, begin = prepared
         recipe, aim = run.recipe, validation.lanes.from_middle()
         self.recipe, self.seed, self.process, self.ranks = recipe, run.seed, process, ranks
-        self.device, self.files = choose_device(process.device), RunFiles(process.output)
-        self.precision = choose_precision(self.device)
-        manual_seed(run.seed)
-        network = NETWORKS[recipe.network](exposure=recipe.exposure)
+        self.device, self.files = compute.choose_device(process.device), RunFiles(process.output)
+        self.precision = compute.choose_precision(self.device)
+        network = compute.seeded(run.seed, functools.partial(NETWORKS[recipe.network], exposure=recipe.exposure))
         self.network = network.to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
-        repeatable(self.device)
-        one_thread()
-        self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
+        compute.repeatable(self.device)
+        compute.one_thread()
+        self.pool = ThreadPoolExecutor(threads(), initializer=compute.one_thread)
         self.training, self.validation = training, validation
         if self.device.type == "cuda" and recipe.on_gpu():
             self.training, self.validation = (part.on_gpu(self.device, self.pool) for part in (training, validation))
@@ -425,9 +424,10 @@ def run(command: Command, ranks: Ranks) -> None:
         training_run.pool.shutdown(cancel_futures=True)
 
 
+@compute.own_settings()
 def execute(command: Command) -> int:
     """Do what the command asks; return the exit status: 0, 2 after an error, 128 + signal if stopped."""
-    keep_freed_memory()
+    compute.keep_freed_memory()
     ranks = Ranks.join(command.process.device)
     return ranks.leave(status_of(lambda: run(command, ranks), command.process, ranks))
 
@@ -437,7 +437,7 @@ def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, 
 
     recordings, output, process: as for the options; a run is resumed only if its recipe and its recordings are these.
     """
-    run = Run(recipe, tuple(map(str, recordings)), int(seed))  # NumPy's could not be saved
+    run = Run(recipe, tuple(map(str, [recordings] if isinstance(recordings, str | Path) else recordings)), int(seed))
     return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))
 
 

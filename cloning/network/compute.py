@@ -5,13 +5,17 @@ import ctypes
 import functools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from threading import Lock
+from typing import TypeVar
 
 import torch
 
 from cloning.base.cores import threads as threads  # re-exported
 from cloning.base.errors import UserError
 
+Made = TypeVar("Made")
+_seeding = Lock()  # torch's generator is that of all threads
 DEVICES = ("auto", "cpu", "cuda", "mps")  # cuda: an NVIDIA GPU; mps: Apple's
 
 
@@ -88,6 +92,35 @@ def keep_freed_memory() -> None:
 def one_thread() -> None:
     """Make torch compute on the calling thread alone, because other threads or processes already occupy the cores."""
     torch.set_num_threads(1)
+
+
+def seeded(seed: int, make: Callable[[], Made]) -> Made:
+    """Return what `make` returns with torch's generator seeded; the caller's goes on as if it had not been used."""
+    with _seeding, torch.random.fork_rng([]):
+        torch.default_generator.manual_seed(seed)
+        return make()
+
+
+@contextlib.contextmanager
+def own_settings() -> Iterator[None]:
+    """A context in which what a caller has set in torch changes no weights; afterwards its settings are as before."""
+    dtype, count, mode = torch.get_default_dtype(), torch.get_num_threads(), torch.get_deterministic_debug_mode()
+    torch.set_default_dtype(torch.float32)
+    one_thread()  # at once: after a fork of a caller whose threads have computed, several would wait for ever
+    try:
+        with (
+            torch.inference_mode(False),
+            torch.enable_grad(),
+            torch.device("cpu"),
+            torch.autocast("cpu", enabled=False),
+            torch.autocast("cuda", enabled=False),
+            torch.random.fork_rng([]),
+        ):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)
+        torch.set_num_threads(count)
+        torch.set_deterministic_debug_mode(mode)
 
 
 class Graphed:

@@ -1,6 +1,7 @@
 """NVIDIA's network, the model file that stores it, and the steering computed with it."""
 
 import platform
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.network import FORMAT, tensors
+from cloning.network.compute import seeded
 from cloning.network.fast_layers import BlockConv2d, elu
 
 VERSION = 1  # of the model file
@@ -151,7 +153,7 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
     """Return the network of a model file, in evaluation mode on the device. Raises ModelError."""
     saved = load_checkpoint(path)
     try:
-        network = read_network(saved)(*read_preprocessing(saved))
+        network = seeded(0, partial(read_network(saved), *read_preprocessing(saved)))
         restore_weights(network, saved)
     except ValueError as error:
         raise ModelError(

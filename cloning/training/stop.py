@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -30,7 +31,7 @@ class StopSignals:
     """A context in which SIGNALS are noted; after one, Ctrl-C or SIGTERM raises KeyboardInterrupt.
 
     SIGHUP is that of a closed terminal; what is printed after it is lost. What the process ignores already, as after
-    `nohup`, it still does.
+    `nohup`, it still does. Only a process's main thread may note signals; in others, as of a sweep, there are none.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,8 @@ class StopSignals:
 
     def __enter__(self) -> "StopSignals":
         self._terminals = [file for file in (1, 2) if os.isatty(file)]
-        noted = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        here = SIGNALS if threading.current_thread() is threading.main_thread() else []
+        noted = [number for number in here if signal.getsignal(number) is not signal.SIG_IGN]
         self._handlers = {number: signal.signal(number, self._note) for number in noted}
         return self
 
