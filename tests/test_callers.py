@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from commands import same, weights
+from steer_server import unused_port
 
 from model import REPORT, ROBUST, train
 
@@ -74,3 +75,12 @@ def test_figures_of_another_type_are_refused(figure: dict[str, Any]):
 def test_lists_as_of_a_file_are_ranges():
     ranges: dict[str, Any] = {"brightness": [0.4, 1.2]}
     assert replace(REPORT, **ranges) == REPORT
+
+
+def test_a_launchers_only_process_trains_several_times(sample_recording, tmp_path, monkeypatch):
+    """As by `torchrun --nproc_per_node=1 sweep.py`."""
+    for name, value in {"RANK": 0, "WORLD_SIZE": 1, "MASTER_ADDR": "localhost", "MASTER_PORT": unused_port()}.items():
+        monkeypatch.setenv(name, str(value))
+    for run in ("a", "b"):
+        assert train(QUICK, [sample_recording], tmp_path / run / "model.pt", device="cpu") == 0
+    assert not torch.distributed.is_initialized()

@@ -31,7 +31,7 @@ class Ranks:
     @classmethod
     def join(cls, device_name: str) -> "Ranks":
         """Join the other processes, if torchrun started this one; device_name: see `choose_device`."""
-        if "RANK" not in os.environ:
+        if "RANK" not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
             return cls()
         device = choose_device(device_name)
         if device.type == "cuda":
