@@ -31,6 +31,12 @@ def test_model_file_carries_what_driving_needs(network, tmp_path):
     torch.testing.assert_close(load_model(path)(frames), network(frames))
 
 
+def test_a_network_without_a_name_is_not_saved(network, tmp_path):
+    compiled: Any = torch.compile(network)
+    with pytest.raises(ModelError, match=r"model\.pt: OptimizedModule has no name in NETWORKS"):
+        save_model(tmp_path / "model.pt", compiled)
+
+
 def refused(path, words: str) -> str:
     """The message of the error with which it is not loaded."""
     with pytest.raises(ModelError, match=words) as error:

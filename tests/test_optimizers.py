@@ -34,12 +34,20 @@ class NormalizedNetwork(Network):
         return [nn.Sequential(first, nn.BatchNorm2d(24)), *others], dense
 
 
+def partly_frozen():
+    """A network whose convolutions are not to be trained further."""
+    network = Network()
+    network.convolutions.requires_grad_(False)
+    return network
+
+
 def cropped_otherwise():
     """A network that would learn from rows 60 to 135 of a frame, and drive by rows 40 to 115."""
     return Network(crop=(40, 45))
 
 
 REFUSED = [(LargeNetwork, "too many"), (NormalizedNetwork, "batch norm"), (cropped_otherwise, r"by \(40, 45")]
+REFUSED += [(partly_frozen, "frozen")]
 
 
 @pytest.mark.parametrize(("kind", "words"), REFUSED)

@@ -118,7 +118,9 @@ def save_model(path: Path, network: Network, **more: object) -> None:
         "offset": network.offset,
         "exposure": network.exposure,
     }
-    name = next(name for name, kind in NETWORKS.items() if kind is type(network))
+    name = next((name for name, kind in NETWORKS.items() if kind is type(network)), None)
+    if name is None:  # also of what torch.compile makes of a network
+        raise ModelError(f"{path}: {type(network).__name__} has no name in NETWORKS, by which a file calls it; add one")
     about = {"format": FORMAT, "version": VERSION, "layers": name, PREPROCESSING: preprocessing, "versions": versions()}
     tensors.save(path, {**about, "network": network.state_dict(), **more})
 

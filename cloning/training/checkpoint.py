@@ -274,8 +274,9 @@ class Checkpoint:
         size = sum(tensor.nbytes for tensor in itertools.chain(network.state_dict().values(), *averages))
         if size > MAX_SIZE - MAX_STRUCTURE:
             raise ModelError(f"the network's weights and their averages take {size:,} bytes, too many for a file")
-        if next(network.buffers(), None) is not None:  # the copies that compute the gradients have their own
-            raise ModelError("a network with batch normalization, or other buffers, can't be trained here")
+        frozen = not all(parameter.requires_grad for parameter in network.parameters())
+        if frozen or next(network.buffers(), None) is not None:  # the copies that compute gradients have their own
+            raise ModelError("a network with batch normalization, other buffers or frozen weights can't be trained")
         if network.crop != CROP:  # it would drive by other rows than those that it learns from
             raise ModelError(f"a network that crops frames by {network.crop}, not {CROP}, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
