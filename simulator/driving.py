@@ -229,10 +229,13 @@ def digest_of(file: Path) -> str:
 
     The weights may be in files that the ONNX file names.
     """
-    parts = [file.read_bytes()] if file.is_file() else []
+    parts, names = [file.read_bytes()] if file.is_file() else [], set[str]()
     if parts and file.suffix == ".onnx":
-        named = (each for each in sorted(file.parent.iterdir()) if each.name.encode() in parts[0])
-        parts += [each.read_bytes() for each in (file.with_suffix(".json"), *named) if each.is_file()]
+        for key in re.finditer(rb"\n\x08location\x12([\x80-\xff]?[\0-\x7f])", parts[0]):  # and the name's length
+            low, high = (key[1] + b"\0")[:2]
+            names.add(parts[0][key.end() : key.end() + low % 128 + 128 * high].decode(errors="replace"))
+        beside = (file.with_suffix(".json"), *(file.parent / name for name in sorted(names)))
+        parts += [each.read_bytes() for each in beside if each.is_file()]
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 

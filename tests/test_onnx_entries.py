@@ -49,7 +49,8 @@ def test_a_network_whose_weights_are_beside_it_is_another_entry_with_others(tmp_
     """Current PyTorch exports them so."""
     import onnx
 
-    path, weights = tmp_path / "own.onnx", tmp_path / "own.onnx.data"
+    path, weights = tmp_path / "own.onnx", tmp_path / "weights" / f"{130 * 'w'}.data"
+    weights.parent.mkdir()
     steers, digests = [], set()
     for constant in (0.25, -0.5):
         model = onnx.load(onnx_file(path, (1, 160, 320, 3), [1, 2, 3], kind=1))
@@ -57,7 +58,7 @@ def test_a_network_whose_weights_are_beside_it_is_another_entry_with_others(tmp_
         model.graph.node.append(onnx.helper.make_node("Add", ["steering", "weight"], ["angle"]))
         model.graph.output[0].name = "angle"
         weights.unlink(missing_ok=True)  # else ONNX would append to it
-        onnx.save(model, path, save_as_external_data=True, location=weights.name, size_threshold=0)
+        onnx.save(model, path, save_as_external_data=True, location=f"weights/{weights.name}", size_threshold=0)
         digests.add(driving.digest_of(path))
         steers.append(driving.load_driver(str(path))(np.zeros((160, 320, 3), np.uint8)))
     assert steers == [0.25, -0.5] and len(digests) == 2
