@@ -129,7 +129,8 @@ def test_a_missing_library_is_installed_where_the_command_finds_it(tmp_path, mon
     assert in_commands("`pip install flask`") == "`pip install flask`"
     folder.mkdir()
     (folder / "pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.13.9\nversion_info = 3.11.7\n", encoding="utf-8")
-    assert in_commands("`pip install flask`") == f'`uv pip install --python "{folder}" flask`'
+    told = in_commands("`pip install flask`")
+    assert told == in_commands(told) == f'`uv pip install --python "{folder}" flask`'
     (folder / "pipx_metadata.json").touch()
     assert in_commands("`pip install flask`") == "`pipx inject behavioral-cloning flask`"
 

@@ -51,7 +51,8 @@ def in_commands(text: str) -> str:
     """Return a text with the commands as the user starts them: `behavioral-cloning drive` for `python drive.py`."""
     for clone, command in installed.items():
         text = text.replace(clone, command)
-    return text.replace("pip install", _pip_install()) if "pip install" in text else text
+    install = _pip_install() if "pip install" in text else ""
+    return text if install in text else text.replace("pip install", install)  # another process may have replaced it
 
 
 def _pip_install() -> str:
