@@ -23,6 +23,7 @@ LOOKS = [(390, True), (1280, False), (2200, True)]  # widths in px, and whether 
 OPTIONS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"),
+    "--remote-debugging-pipe",  # which ends with the tests, also if they are killed, and the browser with it
 )
 
 
@@ -32,8 +33,9 @@ class Page:
     until = staticmethod(awaited)
 
     def __init__(self, profile: Path):
-        command = [CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        piped, null = ["bash", "-c", 'exec "$0" "$@" 3<&0 4>&1'], subprocess.DEVNULL
+        command = [*piped, CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=null, stderr=null)
         written = profile / "DevToolsActivePort"
         port = self.until(lambda: written.exists() and written.read_text(encoding="utf-8")).split()[0]
 
@@ -203,7 +205,7 @@ class Page:
             self.send("Browser.close")
         self.socket.close()
         self.process.kill()
-        self.process.wait()
+        self.process.communicate()
 
 
 def decoded(picture: bytes) -> np.ndarray:
