@@ -108,3 +108,17 @@ def test_a_message_that_was_sent_before_the_answer_is_known(early):
             theirs.sendall(texts[1])
         assert reading.wait() == "41"
         assert websocket.waited != early
+
+
+def test_what_has_arrived_of_a_client_is_left_once_it_is_hung_up_on():
+    """So those that wait for its place do not wait for all that it has sent."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        socket.create_connection(listener.getsockname()) as theirs,
+        eventlet.greenio.GreenSocket(listener.accept()[0]) as ours,
+    ):
+        websocket = WebSocket(ours)
+        theirs.sendall(3 * frame(b"40"))
+        assert websocket.receive() == "40"
+        websocket.hang_up()
+        assert websocket.receive() is None
