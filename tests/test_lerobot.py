@@ -345,11 +345,13 @@ def test_rows_with_the_same_time_are_of_one_drive_and_have_images_of_their_own(t
 
 
 def test_images_of_two_sources_without_dates_have_different_names(tmp_path):
-    sample = Sample(0.5, [np.zeros((160, 320, 3), np.uint8)], {"steering": 0.0})
-    for name in ("one", "two"):
-        write_recording(iter([sample]), tmp_path / name, 1.0, Counter())
-    one, two = ({path.name for path in (tmp_path / name / "IMG").iterdir()} for name in ("one", "two"))
-    assert len(one) == len(two) == 3 and not one & two
+    names = list[set[str]]()
+    for brightness in (1, 2, 1):
+        sample = Sample(0.5, [np.full((160, 320, 3), brightness, np.uint8)], {"steering": 0.0})
+        folder = tmp_path / str(len(names))
+        write_recording(iter([sample]), folder, 1.0, Counter())
+        names.append({path.name for path in (folder / "IMG").iterdir()})
+    assert len(names[0]) == 3 and not names[0] & names[1] and names[0] == names[2]
 
 
 def test_the_middle_of_an_image_that_is_a_pixel_wide_is_a_pixel(tmp_path):

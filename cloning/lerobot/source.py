@@ -81,7 +81,7 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
                 time = last + 2 * DRIVE_GAP
             before, last = time, round(max(time, last + MILLISECOND), 6)  # else the sum falls short of a millisecond
             if start is None:  # others' images get other names where programs put several recordings into one folder
-                start = datetime(1970, 1, 1) if last > UNDATED else start_of(0, folder.name)
+                start = datetime(1970, 1, 1) if last > UNDATED else start_of(0, sample.images[0].tobytes())
             stamp = time_stamp(start + timedelta(seconds=last))
             names = [f"{camera}_{stamp}.jpg" for camera in CAMERAS]
             for name, frame in zip(names, _three([fit(image, notes) for image in sample.images], notes), strict=True):
