@@ -207,7 +207,10 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         page.shows("#matches", "not complete")
         wanted = int((np.abs(recording.steering) > 0.2).sum())
         page.send("Input.insertText", text="-0.2)")
-        page.run("document.activeElement.blur()")
+        written = page.run("condition.value")
+        page.press("Escape")
+        page.wait("document.activeElement == document.body")
+        assert page.run("condition.value") == written != "", "its matches stay, too"
         page.press("e")
         page.shows("#selection", f"what matches: {wanted} frames")
         page.press("Escape")

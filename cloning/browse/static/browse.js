@@ -52,7 +52,9 @@ addEventListener("hashchange", () => route());
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || document.querySelector("dialog[open]")) return;
   if (event.target.matches("input:not(#scrub), select")) {
-    if (event.key == "Escape") event.target.blur();
+    if (event.key != "Escape") return;
+    event.preventDefault(); // it would empty a field of type search, but not take back what it found
+    event.target.blur();
     return;
   }
   if (event.key == "?") help();
