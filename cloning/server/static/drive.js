@@ -294,10 +294,11 @@ function open() {
   close();
   events = new EventSource(element("attention").checked ? "/live?attention" : "/live");
   events.onmessage = hear;
-  events.onerror = () => { // the browser itself would ask again later and later
+  events.onerror = ({target}) => { // the browser itself would ask again later and later
+    target.close(); // Safari asks again even for one that was closed, once its page is come back to
+    if (target != events) return;
     heard = false;
     say("lost");
-    close();
     again = setTimeout(open, AGAIN);
   };
 }
@@ -309,7 +310,8 @@ function close() {
 
 element("attention").onchange = open;
 // A page that nobody sees asks for nothing.
-document.addEventListener("visibilitychange", () => document.hidden ? close() : open());
+const follow = () => document.hidden ? close() : open();
+document.addEventListener("visibilitychange", follow);
 function answer(words, bad = false) {
   element("answer").textContent = words;
   element("answer").className = bad ? "bad" : "";
@@ -349,4 +351,4 @@ for (const code of document.querySelectorAll("#start code, .saved code")) {
   if (navigator.clipboard) code.after(" ", copy); // only on this machine, or with https
 }
 draw();
-open();
+follow();
