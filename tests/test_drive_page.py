@@ -385,7 +385,7 @@ def test_the_road_on_the_map_is_the_one_that_the_car_drives_on(server, jpegs, pa
 
 @needs_chromium
 def test_a_page_that_nobody_sees_asks_for_nothing_and_another_for_one_stream(server, page):
-    """Also one that is opened in a tab behind, and one in which a closed stream has come back, as in Safari."""
+    """Also one in a tab behind, with the attention chosen before, and where a closed stream comes back, as in Safari."""
     own = f"http://127.0.0.1:{server.port}/"
     code = """hidden = true, streams = [];
         Object.defineProperty(document, 'hidden', {get: () => hidden});
@@ -396,8 +396,8 @@ def test_a_page_that_nobody_sees_asks_for_nothing_and_another_for_one_stream(ser
         turn = "document.dispatchEvent(new Event('visibilitychange'))"
         page.wait("document.readyState == 'complete'")
         assert page.run("streams.length") == 0
-        page.run(f"hidden = false; {turn}; hidden = true; {turn}; hidden = false; {turn}")
-        page.wait("streams[1].readyState == 1")
+        page.run(f"attention.checked = true; hidden = false; {turn}; hidden = true; {turn}; hidden = false; {turn}")
+        page.wait("streams[1].readyState == 1 && streams[1].url.endsWith('/live?attention') && !magenta.hidden")
         page.run("streams[0].dispatchEvent(new Event('error')); new Promise(done => setTimeout(done, 20000))")  # 2 s
         assert page.run("streams.map(each => each.readyState)") == [2, 1], "closed, open"
     finally:

@@ -281,7 +281,6 @@ const graphs = GRAPHS.map(graph => new Graph(graph));
 const fit = () => graphs.forEach(graph => graph.plot.setSize(graph.size()));
 new ResizeObserver(fit).observe(element("plots"));
 addEventListener("resize", fit);
-element("attention").addEventListener("change", () => element("magenta").hidden = !element("attention").checked);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   graphs.forEach(graph => graph.build());
   draw();
@@ -292,7 +291,10 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
 
 function open() {
   close();
-  events = new EventSource(element("attention").checked ? "/live?attention" : "/live");
+  if (document.hidden) return; // a page that nobody sees asks for nothing
+  const isShown = element("attention").checked; // from the beginning, where a browser remembers it
+  element("magenta").hidden = !isShown;
+  events = new EventSource(isShown ? "/live?attention" : "/live");
   events.onmessage = hear;
   events.onerror = ({target}) => { // the browser itself would ask again later and later
     target.close(); // Safari asks again even for one that was closed, once its page is come back to
@@ -309,9 +311,7 @@ function close() {
 }
 
 element("attention").onchange = open;
-// A page that nobody sees asks for nothing.
-const follow = () => document.hidden ? close() : open();
-document.addEventListener("visibilitychange", follow);
+document.addEventListener("visibilitychange", open);
 function answer(words, bad = false) {
   element("answer").textContent = words;
   element("answer").className = bad ? "bad" : "";
@@ -351,4 +351,4 @@ for (const code of document.querySelectorAll("#start code, .saved code")) {
   if (navigator.clipboard) code.after(" ", copy); // only on this machine, or with https
 }
 draw();
-follow();
+open();
