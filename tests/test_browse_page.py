@@ -179,6 +179,10 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     draw_path(drawn, float(recording.steering[20]), (204, 102, 0))  # BGR of the human's curve
     path = np.abs(drawn.astype(int) - decoded(frame)).max(axis=2) > 60
     page.until(lambda: np.abs(page.canvas("center").astype(int) - drawn)[path].mean() < 40)
+    page.send("Emulation.setEmulatedMedia", features=[{"name": "forced-colors", "value": "active"}])
+    colour = "getComputedStyle(document.querySelector(each)).backgroundColor"
+    colours = page.run(f"['#paths', '#plots i', '#strip'].map(each => {colour})")
+    assert colours == [*["rgb(0, 102, 204)"] * 2, "rgb(221, 221, 221)"], "with the system's forced colours, too"
     page.look(390, 844)
     page.wait("innerWidth == 390")
     assert page.run("document.querySelector('#where').getBoundingClientRect().bottom") <= 844
