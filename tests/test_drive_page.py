@@ -385,7 +385,7 @@ def test_the_road_on_the_map_is_the_one_that_the_car_drives_on(server, jpegs, pa
 
 @needs_chromium
 def test_a_page_that_nobody_sees_asks_for_nothing_and_another_for_one_stream(server, page):
-    """Also one in a tab behind, with the attention chosen before, and where a closed stream comes back, as in Safari."""
+    """Also one in a tab behind, its attention chosen before, and where a closed stream comes back, as in Safari."""
     own = f"http://127.0.0.1:{server.port}/"
     code = """hidden = true, streams = [];
         Object.defineProperty(document, 'hidden', {get: () => hidden});
