@@ -231,7 +231,8 @@ def digest_of(file: Path) -> str:
     """
     parts, names = [file.read_bytes()] if file.is_file() else [], set[str]()
     if parts and file.suffix == ".onnx":
-        for key in re.finditer(rb"\n\x08location\x12([\x80-\xff]?[\0-\x7f])", parts[0]):  # and the name's length
+        # In its protobuf: the key "location", then a file's name after its length, in one or two bytes of 7 bits each.
+        for key in re.finditer(rb"\n\x08location\x12([\x80-\xff]?[\0-\x7f])", parts[0]):
             low, high = (key[1] + b"\0")[:2]
             names.add(parts[0][key.end() : key.end() + low % 128 + 128 * high].decode(errors="replace"))
         beside = (file.with_suffix(".json"), *(file.parent / name for name in sorted(names)))

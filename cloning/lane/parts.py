@@ -7,6 +7,7 @@ rows after it are sought near its end, where the car must be.
 
 import copy
 import functools
+import itertools
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -166,7 +167,7 @@ class Placing:
     def spread(self, forward: bool) -> None:
         """Place what is left, from the ends of the parts that there are on, or from their starts back."""
         parts, self.parts = self.parts[:: 1 if forward else -1], []
-        for part, other in zip(parts, [*parts[1:], None], strict=False):
+        for part, other in itertools.zip_longest(parts, parts[1:]):
             self.parts.append(part)
             while found := self.next_to(self.parts[-1], other, forward):
                 self.parts.append(found)

@@ -127,8 +127,10 @@ def has_left(environ: WSGIEnvironment) -> bool:
     """Return whether the client of a request that has been read has closed its connection."""
     try:
         return not environ["eventlet.input"].get_socket().fd.recv(1, socket.MSG_PEEK)
-    except OSError as error:
-        return not isinstance(error, BlockingIOError)
+    except BlockingIOError:  # it waits for the answer
+        return False
+    except OSError:
+        return True
 
 
 def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
