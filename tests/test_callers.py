@@ -1,5 +1,6 @@
 """Trainings that other programs call: their settings change no weights, and are as they were afterwards."""
 
+import math
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -69,6 +70,12 @@ def test_threads_train_at_the_same_time_as_one_does(sample_recording, tmp_path, 
 @pytest.mark.parametrize("figure", [{"dropout": 0.2}, {"batch_size": 8.0}, {"learning_rate": "1e-3"}])
 def test_figures_of_another_type_are_refused(figure: dict[str, Any]):
     with pytest.raises(ValueError, match=f"{next(iter(figure))} is .*, not of type"):
+        replace(REPORT, **figure)
+
+
+@pytest.mark.parametrize("figure", [{"flip": 90.0}, {"epochs": 0}, {"learning_rate": math.nan}])
+def test_figures_beyond_their_limits_are_refused(figure: dict[str, Any]):
+    with pytest.raises(ValueError, match=f"{next(iter(figure))} is .*, not a number from .* to .*"):
         replace(REPORT, **figure)
 
 

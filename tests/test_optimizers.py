@@ -14,7 +14,8 @@ from cloning.base.errors import ModelError
 from cloning.network.network import Network
 from cloning.training.checkpoint import METRICS, Checkpoint, Progress, read_saved_run
 from cloning.training.optimizers import Adam, Muon, orthogonal
-from cloning.training.options import MAX_EPOCHS, Process, Run
+from cloning.training.options import Process, Run
+from cloning.training.recipe import LIMITS
 from model import REPORT, ROBUST
 
 
@@ -62,9 +63,10 @@ def test_the_state_of_the_longest_run_can_be_resumed(tmp_path):
     network, chance, path = Network(), np.random.default_rng(1), tmp_path / "model.pt"
     adam = Adam(network.parameters())
     adam.restore({index: adam.zeros(index) for index in range(len(adam.parameters))})
-    rows = ((epoch + 1, 128, *chance.random(4).tolist()) for epoch in range(MAX_EPOCHS))
+    most_epochs = int(LIMITS["epochs"][1])
+    rows = ((epoch + 1, 128, *chance.random(4).tolist()) for epoch in range(most_epochs))
     history = [dict(zip(METRICS, row, strict=True)) for row in rows]
-    progress = Progress(number=MAX_EPOCHS, history=history, trail=chance.random(1999).tolist())
+    progress = Progress(number=most_epochs, history=history, trail=chance.random(1999).tolist())
     Checkpoint(Run(REPORT), Process(str(path)), network, adam, ("", "")).save(progress)
     assert read_saved_run(tmp_path / "model-resume.pt", {"report": REPORT}).progress.history == history
 

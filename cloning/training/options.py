@@ -1,7 +1,7 @@
 """The command line of model.py: its options are fields of the recipe, of the run and of the process."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -12,13 +12,9 @@ from cloning.base.outputs import names_folder
 from cloning.network.compute import DEVICES, is_available
 from cloning.network.network import load_checkpoint
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
-from cloning.training.recipe import Recipe, option_name
+from cloning.training.recipe import LIMITS, Recipe, option_name
 
 MAX_SEED = 2**63 - 1  # torch takes no larger one
-MAX_COUNT = 10**9  # of images in an epoch: more than a lifetime of training
-MAX_EPOCHS = 20_000  # whose losses a model file has room for: see `tensors.MAX_STRUCTURE`
-MAX_BATCH = 10**5  # observations: 56 GB of images
-MAX_REPEATS = 1000  # the report's training keeps as many copies of the rows in memory
 SAVE_SECONDS = 30.0  # between two saved states: the most work that a killed run loses
 
 
@@ -68,22 +64,16 @@ class Command(NamedTuple):
 
 
 # The options that set fields of the recipe, and those of them that have no effect with --robust.
-COPIES = f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}"
-FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
-    "epochs": (number(int, 1, MAX_EPOCHS), "epochs in total; may be raised with --resume"),
-    "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
-    "learning_rate": (number(float, 1e-9, 10), "learning rate of Adam or, with --robust, of Muon"),
-    "samples_per_epoch": (
-        number(int, 1, MAX_COUNT),
-        "smallest number of images in an epoch; a fifth as many observations, at most 4,096, validate it",
-    ),
-    "throttle_threshold": (number(float), "without --robust: drop rows with less throttle, 0 to 1"),
-    "side_correction": (
-        number(float, -1, 1),
-        "without --robust: steering added to the label of left images, subtracted from right ones'",
-    ),
-    "repeats": (number(int, 1, MAX_REPEATS), COPIES),
-    "disturbed": (number(float, 0, 1), "with --robust: share of the images in foul weather, or of a faulty camera"),
+FIGURES = {
+    "epochs": "epochs in total; may be raised with --resume",
+    "batch_size": "observations in a batch; each gives 3.7 images on average",
+    "learning_rate": "learning rate of Adam or, with --robust, of Muon",
+    "samples_per_epoch": "smallest number of images in an epoch; a fifth as many observations, at most 4,096, "
+    "validate it",
+    "throttle_threshold": "without --robust: drop rows with less throttle, 0 to 1",
+    "side_correction": "without --robust: steering added to the label of left images, subtracted from right ones'",
+    "repeats": f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}",
+    "disturbed": "with --robust: share of the images in foul weather, or of a faulty camera",
 }
 REPORT_ONLY, ROBUST_ONLY = ("throttle_threshold", "side_correction"), ("disturbed",)
 
@@ -138,7 +128,8 @@ def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
         f"{', '.join(f'{option_name(name)} {getattr(robust, name):g}' for name in differ)} unless these are given"
     )
     add("--robust", action=argparse.BooleanOptionalAction, help=text)
-    for name, (parse_value, text) in FIGURES.items():
+    for name, text in FIGURES.items():
+        parse_value = number(type(getattr(report, name)), *LIMITS.get(name, ()))
         add(option_name(name), type=parse_value, help=f"{text} (default: {getattr(report, name)})")
     add = parser.add_argument_group("run").add_argument
     text = "on the same machine, the same seed repeats the same run (default: 0)"

@@ -15,6 +15,16 @@ from cloning.network.network import NETWORKS, Exposure
 from cloning.network.tensors import is_number, shown
 from cloning.training.optimizers import OPTIMIZERS
 
+LIMITS: dict[str, tuple[float, float]] = {  # of figures, the least and the most
+    "epochs": (1, 20_000),  # whose losses a model file has room for: see `tensors.MAX_STRUCTURE`
+    "batch_size": (1, 10**5),  # 56 GB of images
+    "samples_per_epoch": (1, 10**9),  # more than a lifetime of training
+    "repeats": (1, 1000),  # the report's training keeps as many copies of the rows in memory
+    "learning_rate": (1e-9, 10),
+    "side_correction": (-1, 1),
+    **dict.fromkeys(("keep_straight", "flip", "shadow", "mirrored", "tinted", "shaded", "disturbed"), (0, 1)),
+}
+
 
 def no_choices(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
     """Return the choices of an augmentation that has none."""
@@ -119,13 +129,16 @@ class Recipe:
     def __post_init__(self) -> None:
         """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain.
 
-        Raises ValueError for a figure of another type, such as a rate for `dropout`, and for another `best_by`, which
-        would be asked for only after an epoch.
+        Raises ValueError for a figure of another type, such as a rate for `dropout`, or beyond its LIMITS, such as
+        percent for a share, and for another `best_by`, which would be asked for only after an epoch.
         """
         for item in fields(self):
             value = _python(getattr(self, item.name))
             if item.type in (bool, int, float) and type(value) not in (item.type, int if item.type is float else None):
                 raise ValueError(f"{item.name} is {value!r}, not of type {item.type.__name__}")
+            least, most = LIMITS.get(item.name, (-math.inf, math.inf))
+            if item.type in (int, float) and not least <= value <= most:
+                raise ValueError(f"{item.name} is {value!r}, not a number from {least:g} to {most:g}")
             object.__setattr__(self, item.name, value)
         if self.best_by not in ("val_loss", "val_drift"):
             raise ValueError(f"best_by is {self.best_by!r}, not 'val_loss' or 'val_drift'")
