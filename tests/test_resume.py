@@ -19,6 +19,7 @@ from rendered import render_recording
 import model
 from cloning.training.distributed import Ranks
 from cloning.training.options import Process
+from cloning.training.recipe import LIMITS
 from cloning.training.stop import Interrupted, StopSignals, status_of
 from model import REPORT
 
@@ -321,8 +322,11 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, tmp_path, monke
 
 
 @pytest.mark.parametrize("samples, save_seconds", [(80, 1e9), (80, 0), (1, 1e9)], ids=["batch", "save", "validation"])
-def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recording, capsys, samples, save_seconds):
+def test_a_run_that_diverges_stops_and_saves_nothing_of_it(
+    begun, sample_recording, monkeypatch, capsys, samples, save_seconds
+):
     """The first step's loss is finite, but the weights after it are not."""
+    monkeypatch.setitem(LIMITS, "learning_rate", (0, np.inf))
     before = (begun / "training_log.csv").read_bytes()
     recipe = replace(REPORT, epochs=2, samples_per_epoch=samples, batch_size=8, learning_rate=np.inf)
     process = {"device": "cpu", "save_seconds": save_seconds}
