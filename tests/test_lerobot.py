@@ -16,7 +16,7 @@ from rendered import render_frame, render_recording
 
 from cloning.base import program
 from cloning.lerobot import __main__ as lerobot
-from cloning.lerobot.source import Sample, write_recording
+from cloning.lerobot.source import Sample, decoded, write_recording
 from cloning.recordings.check import check_images
 from cloning.recordings.images import encode, read_frame
 from cloning.recordings.log import CheckedRecording, read_recording
@@ -25,7 +25,10 @@ from cloning.recordings.saved_frames import FrameSaver
 CENTER = "observation.images.center"
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:"  # a clone's file without git-lfs
 IMAGE = '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": %s}'
-VAST = {"action": {"dtype": "float32", "shape": [10**6], "names": None}}
+VAST = {
+    "action": {"dtype": "float32", "shape": [10**6], "names": None},
+    "state": {"dtype": "float32", "shape": [1], "names": {"motors": {}}},
+}
 
 
 def run(*arguments) -> tuple[str, str]:
@@ -352,6 +355,11 @@ def test_images_of_two_sources_without_dates_have_different_names(tmp_path):
         write_recording(iter([sample]), folder, 1.0, Counter())
         names.append({path.name for path in (folder / "IMG").iterdir()})
     assert len(names[0]) == 3 and not names[0] & names[1] and names[0] == names[2]
+
+
+def test_an_image_whose_end_a_power_failure_replaced_by_zeros_is_damaged():
+    jpeg = encode(np.random.default_rng(0).integers(256, size=(120, 160, 3), dtype=np.uint8), 95)
+    assert decoded(jpeg) is not None and decoded(jpeg[:4096] + bytes(len(jpeg) - 4096)) is None
 
 
 def test_the_middle_of_an_image_that_is_a_pixel_wide_is_a_pixel(tmp_path):

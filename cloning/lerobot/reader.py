@@ -59,7 +59,7 @@ def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str,
         names = each.get("names") or ([key.rpartition(".")[2]] if count == 1 else [str(at) for at in range(count)])
         # Also {"motors": [...]}, [[...]], or each name with its place
         while isinstance(names, dict) or isinstance(next(iter(names), None), list):
-            first = next(iter(names.values())) if isinstance(names, dict) else names[0]
+            first = next(iter(names.values()), ()) if isinstance(names, dict) else names[0]
             names = sorted(names, key=names.__getitem__) if isinstance(first, int) else first
         for at, name in enumerate(names if count else []):
             places[f"{key}:{name}"] = key, at

@@ -103,8 +103,10 @@ def chosen_camera(names: list[str], camera: str | None) -> str:
 
 def decoded(image: bytes) -> np.ndarray | None:
     """Return an image file's pixels, uint8 (rows, columns, 3), RGB, or None if it is damaged."""
+    if not image or (image.startswith(b"\xff\xd8") and b"\xff\xd9" not in image):  # its end is missing, or zeros
+        return None
     try:
-        return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB) if image else None
+        return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB)
     except cv2.error:  # of an image that is larger than OpenCV allows
         return None
 
