@@ -27,7 +27,7 @@ from cloning.base.frame import FRAME
 from cloning.base.outputs import as_typed
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.lane.pilot import Pilot
-from cloning.network.compute import one_thread
+from cloning.network.compute import one_thread, onnx_runtime
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode
@@ -134,7 +134,7 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
             raise UserError(f"{error}; LEADERBOARD.md tells how others can drive") from None
         return lambda frame: float(steer(network, frame))
     try:
-        import onnxruntime  # an optional library
+        onnxruntime = onnx_runtime()
     except ImportError as error:
         raise UserError(f"{error}; pip install onnxruntime") from None
     if not Path(driver).is_file():

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from threading import Lock
+from types import ModuleType
 from typing import TypeVar
 
 import torch
@@ -87,6 +88,17 @@ def keep_freed_memory() -> None:
             libc.mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD
             libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
             libc.mallopt(-8, 1)  # M_ARENA_MAX
+
+
+def onnx_runtime() -> ModuleType:
+    """Return ONNX Runtime, an optional library, which from version 1.29 on reports its use unless told not to.
+
+    Raises ImportError.
+    """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    return onnxruntime
 
 
 def one_thread() -> None:

@@ -27,7 +27,7 @@ from cloning.base.errors import ModelError, UserError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
 from cloning.base.outputs import check_folders
-from cloning.network.compute import one_thread
+from cloning.network.compute import one_thread, onnx_runtime
 from cloning.network.network import Network, load_model
 
 OPSET, IR = 18, 8  # of ONNX's operators and of its files: both are of ONNX 1.13
@@ -41,8 +41,9 @@ def export(network: Network, path: Path) -> None:
     """
     try:
         import onnx
-        import onnxruntime
         import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
+
+        onnxruntime = onnx_runtime()
     except ImportError as error:
         raise UserError(f"{error}; pip install onnx onnxscript onnxruntime") from None
     frames = check_frames()
