@@ -6,6 +6,7 @@ import re
 import shutil
 import zipfile
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -73,6 +74,11 @@ def saved() -> dict:
     contents = torch.load(SHIPPED_MODEL, weights_only=True)
     del contents["digest"]
     return contents
+
+
+def test_a_file_of_another_user_is_not_to_be_trained_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(tensors, "open", Mock(side_effect=PermissionError(13, "Permission denied")), raising=False)
+    assert refused(tmp_path / "model.pt", "denied").endswith("model.pt: Permission denied; make it readable")
 
 
 def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(saved, tmp_path):

@@ -51,6 +51,8 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
             raise ValueError("its contents do not match its digest")
     except FileNotFoundError:
         raise ModelError(f"{path}: no such file; {remedy}") from None
+    except PermissionError as error:
+        raise ModelError(f"{path}: {error.strerror}; make it readable") from None
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}; {remedy}") from error
     except Exception as error:  # torch.load and pickle raise all sorts for a foreign or damaged file
