@@ -54,8 +54,9 @@ def export(network: Network, path: Path) -> None:
         expected = network(torch.from_numpy(frames)).numpy()
     with written_whole(path) as temporary:
         exported.save(temporary)
-        onnx.checker.check_model(temporary, full_check=True)
-        (steering,) = onnxruntime.InferenceSession(temporary).run(["steering"], {"frames": frames})
+        model = temporary.read_bytes()  # a name that is no text, these libraries refuse
+        onnx.checker.check_model(model, full_check=True)
+        (steering,) = onnxruntime.InferenceSession(model).run(["steering"], {"frames": frames})
         worst = float(np.abs(steering - expected).max())
         if not worst <= TOLERANCE:
             raise ModelError(f"{path}: its steering differs by {worst:.1e} from the model's; nothing was written")
