@@ -126,6 +126,7 @@ def test_the_report_is_written_as_markdown(written):
     assert "## Training" in text and "data:" not in text
     assert re.search(r"^\| .*lake sample \| 60 \| 0 \| 0 \|", text, re.MULTILINE)
     assert re.search(r"^\| the network \| -?[\d.]+ % \|", text, re.MULTILINE)
+    assert re.search(r"\| limit 1 m \|.*\n\| the network", text)  # no second head in one table
     pictures = re.findall(r"!\[[^]]+\]\((report/\d+\.(?:jpg|png|svg))\)", text)
     assert len(pictures) == len([*(written / "report").iterdir()]) >= 3 + 6 + 2 + 3
     assert all((written / picture).stat().st_size for picture in pictures)
