@@ -268,7 +268,7 @@ def set_position(name, value):
         (lambda saved: saved["arguments"]["recipe"].update(views="Others"), "views is 'Others', not CameraViews"),
         (lambda saved: saved["arguments"]["recipe"].update(name="mine"), "recipe is 'mine', not report or robust"),
         (lambda saved: saved["arguments"].pop("recipe") and saved["arguments"].update(loss="cubed"), "loss is 'cubed'"),
-        (lambda saved: saved.update(layers="other"), "layers are 'other', not nvidia"),
+        (lambda saved: saved.update(layers="other"), "not nvidia (your own belong in network.py: see "),
         (lambda saved: saved["recipe"].update(crop=(61, 24)), "its preprocessing is not"),
         (lambda saved: saved["recipe"].update(scale=0), "scale 0"),
         (lambda saved: saved["network"].update({"dense.3.bias": torch.full((1,), torch.inf)}), "not finite"),

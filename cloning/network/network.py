@@ -169,7 +169,8 @@ def read_network(saved: dict[str, Any]) -> type[Network]:
     """Return the kind of network that a model file contains, NVIDIA's in an earlier version's. Raises ValueError."""
     name = saved.get("layers", "nvidia")
     if not isinstance(name, str) or name not in NETWORKS:
-        raise ValueError(f"its layers are {tensors.shown(name)}, not {' or '.join(NETWORKS)}")
+        known = f"{' or '.join(NETWORKS)} (your own belong in {Path(__file__).name}: see CONTRIBUTING.md)"
+        raise ValueError(f"its layers are {tensors.shown(name)}, not {known}")
     return NETWORKS[name]
 
 
