@@ -172,7 +172,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add = benchmark.add_argument
     add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
     add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to two hours")
-    text = "for report.html and benchmark.json (default: %(default)s)"
+    text = "for report.html and benchmark.json, whose earlier ones are replaced (default: %(default)s)"
     add("--folder", type=Path, default=Path("benchmark"), help=text)
     add("--resume", action="store_true", help="go on there after the drives of a benchmark that was interrupted")
     add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
