@@ -30,7 +30,7 @@ from cloning.base.frame import FRAME
 from cloning.base.outputs import as_typed, plural
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.lane.pilot import Pilot
-from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
+from cloning.network.network import FOREIGN, SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import MPH, SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.server import page, terminal
@@ -39,8 +39,6 @@ from cloning.server.status_line import StatusLine
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_speed, parse_telemetry
 from cloning.wire.protocol import PORT
 
-# By the endings of files that other projects' drive.py takes, and of those that cloning.network.export makes.
-FOREIGN = {".h5": "Keras", ".hdf5": "Keras", ".keras": "Keras", ".json": "Keras", ".onnx": "ONNX"}
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 SLOWEST_MPH = 5.0  # to which risk slows the car down, before it is stopped
 FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer

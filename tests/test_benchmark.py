@@ -191,7 +191,7 @@ def test_a_damaged_file_of_the_drives_that_are_done_is_told(tmp_path, damaged):
 
 def test_a_network_of_another_program_is_told_how_it_can_drive(tmp_path):
     (tmp_path / "model.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
-    with pytest.raises(UserError, match=r"model\.h5: not a model of this project.*; LEADERBOARD\.md tells how others"):
+    with pytest.raises(UserError, match=r"model\.h5: a model of Keras.*; LEADERBOARD\.md tells how others"):
         driving.load_driver(str(tmp_path / "model.h5"))
 
 

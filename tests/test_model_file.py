@@ -81,6 +81,11 @@ def test_a_file_of_another_user_is_not_to_be_trained_anew(tmp_path, monkeypatch)
     assert refused(tmp_path / "model.pt", "denied").endswith("model.pt: Permission denied; make it readable")
 
 
+def test_a_model_of_another_library_is_called_so(tmp_path):
+    (tmp_path / "model.h5").write_bytes(b"\x89HDF\r\n")
+    refused(tmp_path / "model.h5", "a model of Keras, which PyTorch can't read")
+
+
 def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(saved, tmp_path):
     path, data, chance = tmp_path / "model.pt", SHIPPED_MODEL.read_bytes(), random.Random(1)
     anywhere = [chance.randrange(len(data)) for _ in range(40)]

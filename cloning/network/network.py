@@ -18,6 +18,8 @@ from cloning.network.compute import seeded
 from cloning.network.fast_layers import BlockConv2d, elu
 
 VERSION = 1  # of the model file
+# By the endings of files that other projects' drive.py takes, and of those that cloning.network.export makes.
+FOREIGN = {".h5": "Keras", ".hdf5": "Keras", ".keras": "Keras", ".json": "Keras", ".onnx": "ONNX"}
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
 PREPROCESSING = "recipe"  # the key of frame, colour, crop, scale, offset and exposure in the file
 COLOUR = "RGB"  # order of a frame's colours
@@ -137,6 +139,8 @@ def versions() -> dict[str, str]:
 
 def load_checkpoint(path: str | Path, remedy: str = "`python model.py` trains a model") -> dict[str, Any]:
     """Return the contents of a model file, read without running code from it. Raises ModelError, with the remedy."""
+    if kind := FOREIGN.get(Path(path).suffix):
+        raise ModelError(f"{path}: a model of {kind}, which PyTorch can't read; {remedy}")
     saved = tensors.load(path, remedy)
     if saved.get("format") != FORMAT:
         raise ModelError(f"{path}: not a model of this project; {remedy}")
