@@ -79,7 +79,8 @@ class ClientSession:
             else:
                 if self._connection.asked and not self._told:
                     self._told = True
-                    _print("this server waited to be asked for a connection: the real simulator would get no answer")
+                    unlike = "the real simulator would get no answer (python-socketio 4.6.1 gives it one)"
+                    _print(f"this server waited to be asked for a connection: {unlike}")
 
     def _patience_ends(self) -> float:
         """Return the time.monotonic() at which patience ends; it begins when the first thing is waited for."""
