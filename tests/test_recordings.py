@@ -163,7 +163,7 @@ def test_a_header_within_a_long_file(log):
         (f"{images(9)},0,0.38,0,19647", Finding.OUT_OF_RANGE, "(has its decimal point been lost, or"),  # 14
         ("=======", Finding.MERGE_CONFLICT, "merge"),  # 16
         ("<<<<<<< HEAD", Finding.MERGE_CONFLICT, "merge"),
-        ("IMG/center_x.jpg, 0.0", Finding.NOT_A_ROW, "1 image name where center, left, right belong"),  # 18
+        ("IMG/center_x.jpg, 0.0", Finding.NOT_A_ROW, "1 image name where center, left, right belong; delete"),  # 18
         (f"{images(9)},1.2,0,0,9", Finding.OUT_OF_RANGE, "steering 1.2 is not in -1..1"),  # 19
         *((f"{images(9)},{bad},0,0,9", Finding.NOT_A_NUMBER, f"'{bad},0,0,9'") for bad in ("nan", "1_0", "1e", "")),
         (f"{images(9)},1,175494E-38,0,0", Finding.NOT_A_NUMBER, "1,175494E-38"),  # three with a decimal comma

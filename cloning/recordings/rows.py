@@ -202,7 +202,8 @@ class RowReader:
         if not all(map(is_image, images)):
             count = sum(map(is_image, fields))
             found = f"{'1 image name' if count == 1 else f'{count} image names'} where {', '.join(CAMERAS)} belong"
-            raise UnclearRowError(Finding.NOT_A_ROW, f"{found}; record again, add them, or {REMEDY}")
+            remedy = f"record again, add them, or {REMEDY}"
+            raise UnclearRowError(Finding.NOT_A_ROW, f"{found}; delete the row; if all are so, {remedy}")
         names, extra = [base_name(image) for image in images], fields[len(columns) :]
         check_names(names)
         tokens = [*numbers, *extra]
