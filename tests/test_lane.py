@@ -170,6 +170,21 @@ def test_strips_are_those_of_the_rows_asked_for(lake_drive):
     assert np.array_equal(read_strips(lake_drive[0], slice(5, 9)), read_strips(lake_drive[0], slice(0, 10))[5:9])
 
 
+def test_a_long_recordings_strips_are_never_all_in_memory(lake_drive, monkeypatch):
+    recording, driven, sizes = lake_drive[0], stretches(lake_drive[0]), []
+    kept = estimate_lane_position(recording, driven)
+
+    def read(*arguments):
+        sizes.append(len(strips := read_strips(*arguments)))
+        return strips
+
+    monkeypatch.setattr("cloning.lane.localise.read_strips", read)
+    monkeypatch.setattr("cloning.lane.localise.KEPT_STRIPS", 0)
+    monkeypatch.setattr("cloning.lane.localise.DETECTED_ROWS", 16)
+    found = estimate_lane_position(recording, driven)
+    assert np.array_equal(found.lateral_offset, kept.lateral_offset) and sizes[0] == 16 < len(recording)
+
+
 def test_cameras_and_rows_are_fused(lake_drive):
     """Perfect detections of a straight road from a car that drives along it, 0.7 m right of the centre."""
     recording = copy.deepcopy(lake_drive[0])

@@ -43,6 +43,8 @@ SAMPLE = 50  # rows from which exchanged colours are told
 # than twice that and 0.24 or more; in rendered ones up to 0.21, and at least 0.65 times as much with them exchanged.
 COLOUR_ERROR = 0.2
 LINE_ROUNDS = 3  # in each, the painted line is expected where the one before found it
+KEPT_STRIPS = 30_000  # rows, 1.4 GB: those of longer recordings, of 200,000 rows 9 GB, are read when they are needed
+DETECTED_ROWS = 1024  # at once
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
 
@@ -190,10 +192,17 @@ def estimate_lane_position(
     If the steering's sign, the cameras' order or the colours are certainly wrong, it is printed. Raises RecordingError
     for images that can't be read, ModelError without a usable network.
     """
-    strips = read_strips(recording)
+    strips: Strips = functools.partial(read_strips, recording)
+    if len(recording) <= KEPT_STRIPS:
+        strips = strips(slice(None)).__getitem__
     networks = [network] if network else list(shipped_networks())
-    detect = functools.cache(functools.partial(estimate_centres, strips))
-    position, localised = localise_recording(recording, stretches, detect, strips.__getitem__, networks)
+
+    @functools.cache
+    def detect(network: LaneNetwork) -> np.ndarray:
+        starts = range(0, max(1, len(recording)), DETECTED_ROWS)
+        return np.concatenate([estimate_centres(strips(slice(at, at + DETECTED_ROWS)), network) for at in starts])
+
+    position, localised = localise_recording(recording, stretches, detect, strips, networks)
     log = recording.folder / DRIVING_LOG
     if not localised and steers_against_bends(recording, detect(networks[-1])):
         against = "the car steers left where the cameras see the road bend to the right, and vice versa"
@@ -204,6 +213,6 @@ def estimate_lane_position(
         exchanged = "the cameras do not see the lane as from the car's left, centre and right"
         print(f"{log}: {exchanged}: has each image the name of its camera, is none mirrored?", flush=True)
     sample = np.unique(np.linspace(0, len(recording) - 1, SAMPLE).astype(int))
-    if colours_exchanged(strips[sample], networks[-1]):
+    if colours_exchanged(np.concatenate([strips(slice(row, row + 1)) for row in sample.tolist()]), networks[-1]):
         print(f"{log}: the images seem to have red and blue exchanged: exchange them again (cv2 has BGR)", flush=True)
     return position
