@@ -3,6 +3,7 @@
 import json
 import runpy
 import shutil
+import tracemalloc
 from collections import Counter
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from rendered import render_frame, render_recording
 
 from cloning.base import program
 from cloning.lerobot import __main__ as lerobot
+from cloning.lerobot import dataset
 from cloning.lerobot.source import Sample, decoded, write_recording
 from cloning.recordings.check import check_images
 from cloning.recordings.images import encode, read_frame
@@ -120,6 +122,15 @@ def test_a_data_set_has_what_lerobots_format_names(written):
     np.testing.assert_allclose(statistics["action"]["q90"], np.quantile(rows["action"], 0.9, axis=0))
     assert np.shape(statistics[CENTER]["mean"]) == (3, 1, 1) and 0.3 < np.mean(statistics[CENTER]["mean"]) < 0.6
     assert episodes["stats/action/max"][2] == pytest.approx(np.max(rows["action"][14:], axis=0))
+
+
+def test_the_statistics_of_many_frames_take_little_memory():
+    frames = np.arange(12_000, dtype=np.uint8)[:, None, None, None].repeat(3, -1).repeat(99, 1)
+    tracemalloc.start()
+    found = dataset._statistics(frames)
+    assert tracemalloc.get_traced_memory()[1] < 5 * dataset.COUNTED * frames[0].size * 8 and found["count"] == [12_000]
+    tracemalloc.stop()
+    np.testing.assert_allclose(np.ravel(found["mean"]), 0.5, atol=0.01)
 
 
 def test_a_recording_comes_back_with_the_same_rows(recordings, written, tmp_path, monkeypatch):
