@@ -2,7 +2,9 @@
 
 import json
 import socket
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ from test_excluded import center
 
 from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
+from cloning.browse.library import Library
+from cloning.browse.page import create_app
+from cloning.browse.runs import Runs
 from cloning.lane.reader import SHIPPED_WEIGHTS
 from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
@@ -57,6 +62,14 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
         assert served.ask(f"{here}/rows/7/{name}.jpg", If_None_Match=headers["Etag"])[:2] == (304, b"")
     spoilt = served.answer(f"{served.recordings()['spoilt']}/overview")
     assert "driving_log.csv: line 1: neither a row nor a header" in spoilt["message"] and "frames" not in spoilt
+
+
+def test_others_are_answered_while_thousands_of_runs_are_looked_at(tmp_path, monkeypatch):
+    runs = Runs([tmp_path])
+    monkeypatch.setattr(runs, "found", lambda: [threading.get_native_id()])
+    with closing(Library([], [])) as library:
+        [thread] = create_app(library, runs).test_client().get("/runs").get_json()
+    assert thread != threading.get_native_id()
 
 
 def test_replays_and_runs_over_the_socket(served, sample_recording):

@@ -147,7 +147,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/runs")
     def found() -> list[dict[str, Any]]:
-        return runs.found()
+        return eventlet.tpool.execute(runs.found)  # in a thread, as there may be thousands
 
     @app.get("/runs/<int:index>")
     def run(index: int) -> dict[str, Any]:

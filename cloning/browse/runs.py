@@ -5,6 +5,7 @@ import functools
 import json
 import math
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ class Runs:
         folders = folders or [Path()]
         self.files = [RunFiles(str(folder / "model.pt")) for folder in folders]
         self.names = short_names(folders)
+        self._looking = threading.Lock()  # else one thread, which locks a run's folder for a moment, is another's run
 
     def found(self) -> list[dict[str, Any]]:
         """Return what the list shows of each run; {"message"} instead of figures if it can't be read or has not begun.
@@ -41,7 +43,7 @@ class Runs:
         for index, files in enumerate(self.files):
             if files.arguments.exists() or self.asked:
                 try:
-                    known = overview(files)
+                    known = self._overview(files)
                     known = {key: known[key] for key in known.keys() - {"pictures", "trail", "history", "options"}}
                 except (UserError, OSError) as error:
                     known = {"message": program.in_commands(message_of(error))}
@@ -51,7 +53,7 @@ class Runs:
     def run(self, index: int) -> dict[str, Any]:
         """Return what the page shows of a run. Raises UserError, OSError."""
         files = self._files(index)
-        return self._place(index) | overview(files)
+        return self._place(index) | self._overview(files)
 
     def picture(self, index: int, name: str) -> bytes:
         """Return a diagnostic picture, a PNG. Raises UserError, OSError."""
@@ -74,6 +76,10 @@ class Runs:
         if not page.lstrip().startswith(b"<!doctype html>"):  # a link to something else
             raise UserError(f"{path}: not a report; {writes}")
         return page
+
+    def _overview(self, files: RunFiles) -> dict[str, Any]:
+        with self._looking:
+            return overview(files)
 
     def _place(self, index: int) -> dict[str, Any]:
         folder = self.files[index].last.parent

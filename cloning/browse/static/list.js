@@ -12,6 +12,7 @@ const known = new Map(); // card -> its recording's overview
 const histograms = new Map(); // card -> its histogram
 let selected = new Set(); // ids of recordings
 let lost = false; // whether the server has not answered
+const pauseSince = began => Math.max(AGAIN, performance.now() - began); // there may be thousands
 
 export function leaveList() {
   shown += 1;
@@ -134,6 +135,7 @@ element("compare").onclick = () => {
 // Training runs and cards
 
 async function showRuns(now) {
+  const began = performance.now();
   try {
     const runs = await request("/runs");
     if (now != shown) return;
@@ -150,7 +152,7 @@ async function showRuns(now) {
     if (now != shown) return;
     tellLost(error);
   }
-  if (now == shown) setTimeout(() => now == shown && showRuns(now), AGAIN);
+  if (now == shown) setTimeout(() => now == shown && showRuns(now), pauseSince(began));
 }
 
 // What is drawn on a canvas does not follow the system's colours by itself.
@@ -173,7 +175,7 @@ async function follow(now) {
     if (message || PENDING.includes(lane.state)) await fill(id, card, now).catch(error => now == shown && tellLost(error));
     if (now != shown) return;
   }
-  setTimeout(() => now == shown && follow(now), Math.max(AGAIN, performance.now() - began)); // there may be thousands
+  setTimeout(() => now == shown && follow(now), pauseSince(began));
 }
 
 // Once the server answers again, all is shown anew.
