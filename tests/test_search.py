@@ -1,6 +1,7 @@
 """The search for roads on which a driver fails, with a driver that goes straight on."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -73,6 +74,15 @@ def test_diversity_is_the_angle_between_straight_and_turned_roads():
     assert search.diversity([straight, arc]) == pytest.approx(90 / np.sqrt(3), abs=1)
     assert search.diversity([arc, arc]) == 0
     assert search.diversity([arc]) is None
+
+
+def test_the_diversity_of_thousands_of_roads_takes_little_memory(monkeypatch):
+    road = make_road([(x, 0) for x in range(0, 80, 4)])
+    track = search.Track(road)
+    monkeypatch.setattr(search, "Track", lambda _: track)
+    tracemalloc.start()
+    assert search.diversity([road] * 1000) == 0 and tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
 
 
 def test_wrong_drivers_and_folders_are_refused_and_a_server_drives_one_car(tmp_path, monkeypatch):

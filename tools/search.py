@@ -17,6 +17,7 @@ printed; and failures.png: the roads from above, and where the car left them.
 
 import functools
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -91,8 +92,10 @@ def diversity(roads: Sequence[PointRoad]) -> float | None:
     for track in map(Track, roads):
         heading = track.heading[track.first + np.linspace(0, track.length / track.step, PLACES).astype(int)]
         directions.append(np.degrees(heading - heading[0]))
-    pairs = [np.sqrt(np.square(a - b).mean()) for a, b in itertools.combinations(directions, 2)]
-    return round(float(np.mean(pairs)), 1) if pairs else None
+    # One road with all after it at once: 10,000 roads have 50 million pairs.
+    rows = np.array(directions)
+    sums = [np.sqrt(np.square(rows[at + 1 :] - rows[at]).mean(1)).sum() for at in range(len(rows) - 1)]
+    return round(float(sum(sums)) / math.comb(len(rows), 2), 1) if sums else None
 
 
 Driven = tuple[PointRoad, Drive]
