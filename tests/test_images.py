@@ -234,13 +234,15 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     np.testing.assert_array_equal(again.digests, found.digests)
 
 
-def test_ctrl_c_does_not_wait_for_all_images(copied, monkeypatch):
-    read = Mock(side_effect=read_jpeg)
+def test_ctrl_c_does_not_wait_for_all_images_and_loses_none_that_was_checked(copied, monkeypatch):
+    read, at_once = Mock(side_effect=read_jpeg), check.IMAGES_AT_ONCE
     monkeypatch.setattr(check, "read_jpeg", read)
-    monkeypatch.setattr("cloning.base.progress.Bar.update", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("cloning.base.progress.Bar.update", Mock(side_effect=[*[None] * at_once, KeyboardInterrupt]))
         check_images(read_recording(copied), threads=1)
-    assert read.call_count <= check.IMAGES_AT_ONCE < 180
+    assert read.call_count <= 2 * at_once < 180
+    read.reset_mock()
+    assert len(check_images(read_recording(copied))) == 60 and read.call_count == 180 - at_once
 
 
 def upper_case_endings(folder: Path) -> None:

@@ -41,14 +41,14 @@ def check_images(
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
     cache = cache_file(folder)
-    digests, is_known = _read_cache(cache, names, states)
+    digests, is_usable = _read_cache(cache, names, states)
     is_missing = states[:, 0] < 0
     reasons: dict[int, str] = {}  # why an image is unusable, by its index, and what to do
     if is_missing.any():
         remedy = _remedies(folder)
         for image in np.flatnonzero(is_missing).tolist():
             reasons[image] = f"missing; {remedy(os.fsdecode(names[image]))}"
-    todo = np.flatnonzero(~is_known & ~is_missing)
+    todo = np.flatnonzero(~is_usable & ~is_missing)
 
     def examine(image: int) -> None:
         try:
@@ -59,15 +59,17 @@ def check_images(
             reasons[image] = f"{error}; {REMEDY}"
 
     title, hidden = f"checking images of {printable(recording.folder.name)}", not show_progress or not len(todo)
-    with ThreadPoolExecutor(threads) as pool, progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar:
-        remaining = iter(todo.tolist())
-        while part := list(islice(remaining, IMAGES_AT_ONCE * threads)):
-            for _ in pool.map(examine, part):
-                bar.update()
-    is_usable = np.ones(len(names), bool)
-    is_usable[list(reasons)] = False
-    if is_usable[todo].any():
-        _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
+    bar, remaining = progress_bar(len(todo), "image", hidden, desc=title, leave=False), iter(todo.tolist())
+    try:
+        with ThreadPoolExecutor(threads) as pool, bar:
+            while part := list(islice(remaining, IMAGES_AT_ONCE * threads)):
+                for _ in pool.map(examine, part):
+                    bar.update()
+                is_usable[part] = True
+    finally:  # also what was checked until Ctrl-C
+        is_usable[list(reasons)] = False
+        if is_usable[todo].any():
+            _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
     unusable = ~is_usable[recording.images]
     original = _originals(recording, digests)
     unusable |= (original != recording.images) & ~unusable.any(1, keepdims=True)
