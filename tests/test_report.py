@@ -27,6 +27,7 @@ from cloning.replay.score import YARDSTICKS
 from cloning.report import __main__ as command
 from cloning.report.content import Report, in_words
 from cloning.report.pictures import epochs_chart, film_uri, picture_uri, steering_chart
+from model import ROBUST
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
@@ -228,6 +229,14 @@ def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned
     found = Report(written)
     found.replay([same])
     assert [each["which"] for each in found.replays] == ["it was trained on"], "as a copy of it was"
+
+
+def test_images_of_robust_are_not_said_to_be_the_recorded_and_the_mirrored_ones(written, tmp_path):
+    copy = shutil.copytree(written, tmp_path / "run")
+    arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    (copy / "training_arguments.json").write_text(json.dumps(arguments | {"robust": True, "recipe": ROBUST.saved()}))
+    text = " ".join(Report(copy).page().split())
+    assert "Of each observation there are one such image, another one (90 % of them), one that is 0.4" in text
 
 
 def test_the_report_is_of_the_network_whose_figures_it_has(written, tmp_path):
