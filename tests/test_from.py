@@ -52,7 +52,9 @@ def test_it_keeps_the_file_also_as_its_own_output_and_is_resumed_exactly_without
     """`model.py --from model.pt` in the folder of the earlier run, the shortest command, against a run in two parts."""
     before, parts = weights(base), tmp_path / "parts" / "model.pt"
     command = (sample_recording, *FEW, "--from", base)
-    assert f"begins with the weights of {base}" in trained(*command, "--epochs", 1, "--output", parts)
+    printed = trained(*command, "--epochs", 1, "--output", parts)
+    assert f"begins with the weights of {base}" in printed
+    assert "may have been trained on this run's validation frames" in printed, "with other recordings, on all of them"
     trained(*command, "--output", base)
     assert same(weights(tmp_path / "base-previous.pt"), before)
     whole = base.rename(tmp_path / "whole.pt")

@@ -308,6 +308,7 @@ class Checkpoint:
                 print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
         elif self.run.from_model:
             print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
+            print("it may have been trained on this run's validation frames: judge it by a recording that it never saw")
 
     def save(self, progress: Progress, *models: Path) -> None:
         """Write these models, then model-resume.pt with all that --resume needs, then how far it is. Raises OSError."""
