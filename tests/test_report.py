@@ -77,7 +77,7 @@ def test_the_report_contains_the_run(written, finished):
     assert f"python drive.py &#39;{written / 'model-best.pt'}&#39;" in text and "my run/robust/model.pt" in text
     for driver in ("the network", *YARDSTICKS.values(), "recovery steering"):
         assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
-    encoded = re.findall(r'srcset="data:image/svg\+xml;base64,([^"]*)', page)
+    encoded = re.findall(r'class="dark" src="data:image/svg\+xml;base64,([^"]*)', page)
     charts = [base64.b64decode(each).decode() for each in encoded]
     resampled = re.search(r"([\d,]+) observations after resampling", printed)
     assert "of 60 rows, as driven" in charts[0] and resampled and f"of {resampled[1]} for training" in charts[0]
@@ -255,6 +255,7 @@ def test_the_report_is_of_the_network_whose_figures_it_has(written, tmp_path):
 
 @needs_chromium
 def test_the_page_fits_every_screen_bars_nobody_and_asks_for_nothing(written, page):
+    printed = set[int]()
     for width, dark in LOOKS:
         page.look(width, 900, dark)
         page.open((written / "report.html").as_uri())
@@ -264,3 +265,5 @@ def test_the_page_fits_every_screen_bars_nobody_and_asks_for_nothing(written, pa
         assert page.complaints() == []
         assert page.run("[...document.images].every(image => image.naturalWidth > 100)")
         assert all(address.startswith(("file:", "data:")) for address in page.addresses())
+        printed.add(len(page.send("Page.printToPDF")["data"]))
+    assert len(printed) == 1, "in dark ink, whatever the system's colours"

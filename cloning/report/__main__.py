@@ -78,7 +78,7 @@ def write_markdown(page: str, path: Path) -> None:
         return pictures[-1]
 
     content = page[page.index("<main>") : page.index("</main>")]
-    content = re.sub(r"<source[^>]*>|<video.*?</video>", "", content, flags=re.DOTALL)  # dark twins, films
+    content = re.sub(r"<img class=.dark[^>]*>|<video.*?</video>", "", content, flags=re.DOTALL)  # dark twins, films
     content = re.sub(r'<th scope="rowgroup"(.*?)</th>', r"<td\1</td>", content)  # not another head of the table
     content = re.sub(r'data:image/([\w+]+);base64,([^"]+)', saved, content)
     text = markdown_library().markdownify(content, heading_style="ATX", bullets="*", escape_misc=True)
