@@ -108,6 +108,23 @@ def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, pag
         assert page.run("document.activeElement.textContent") == "Pause"
 
 
+def test_a_browser_is_asked_for_a_few_of_thousands_of_recordings_at_a_time(server, page):
+    page.open(server.base)
+    page.shows("#total", "1 recording")
+    page.run("""busy = most = 0; own = fetch; fetch = async path => {
+        if (!path.startsWith('/recordings')) return own(path);
+        most = Math.max(most, ++busy);
+        await new Promise(done => setTimeout(done));
+        busy -= 1;
+        return Response.json(path != '/recordings' ? {name: path, message: 'spoilt'}
+            : Array.from({length: 200}, (_, id) => ({id, folder: ''})));
+    }; 0""")
+    for place, shown in (("#/compare", "#table tbody tr"), ("#", "article .bad")):
+        page.run(f"most = 0; location.hash = '{place}'")
+        page.wait(f"document.querySelectorAll('{shown}').length == 200")
+        assert page.run("most") == 6
+
+
 def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(server, linked, page):
     cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
     cuts.write_text("spoilt\n", encoding="utf-8")

@@ -19,6 +19,14 @@ export async function request(path, {binary = false, ...options} = {}) {
   return binary ? answer.arrayBuffer() : answer.json();
 }
 
+// The answers to questions about each of many things, a few at a time: browsers refuse thousands of requests at once.
+export async function askAll(things, question) {
+  const rest = things.entries(), answers = [];
+  const some = async () => { for (const [at, thing] of rest) answers[at] = await question(thing, at); };
+  await Promise.all(Array.from({length: 6}, some));
+  return answers;
+}
+
 export function notice(message = "") {
   if (element("notice").textContent != message) element("notice").textContent = message; // else it is read out again
   element("notice").hidden = !message;

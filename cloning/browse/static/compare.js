@@ -1,5 +1,5 @@
 // Several recordings and several models in one table: how they were driven, and how the models steer and drive there.
-import {ask, element, make, makeButton, many, notice, renew} from "./common.js";
+import {ask, askAll, element, make, makeButton, many, notice, renew} from "./common.js";
 import {LIMITS, waits} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
@@ -40,7 +40,7 @@ async function refresh(now, method) {
   const again = () => now.timer = setTimeout(() => refresh(now, "GET"), AGAIN);
   let found;
   try {
-    found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
+    found = await askAll(now.ids, id => open == now && ask(`/${id}/compared?limit=${now.limit}`, {method}));
   } catch (error) {
     if (open != now || now.asking != mine) return;
     now.lost = true;

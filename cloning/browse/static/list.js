@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, histogram, make, makeButton, many, notice, refill, renew, request} from "./common.js";
+import {ask, askAll, element, histogram, make, makeButton, many, notice, refill, renew, request} from "./common.js";
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
@@ -40,7 +40,7 @@ export async function showList(state, from) {
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
   element("finding").hidden = !cards.length;
-  await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
+  await askAll(recordings, ({id}, at) => now == shown && fill(id, cards[at], now));
   if (now != shown) return;
   follow(now);
   if (document.activeElement == document.body) {
@@ -104,7 +104,7 @@ function arrange() {
     const title = "Pause the analyses of all recordings, or go on with them";
     const button = makeButton(isPaused ? "Go on" : "Pause", {title}, () =>
       request("/analyses", {method: isPaused ? "POST" : "DELETE"})
-        .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown))))
+        .then(() => askAll([...known], ([card, {id}]) => fill(id, card, shown)))
         .catch(error => notice(error.message)));
     return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
   });
