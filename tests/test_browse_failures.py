@@ -106,6 +106,14 @@ def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, pag
         page.run("document.querySelector('#findings button').focus(); n = 69")
         page.shows("#findings", "7 % analysed")
         assert page.run("document.activeElement.textContent") == "Pause"
+        assert (
+            page.run("""import('/static/common.js').then(({refill, make}) => {
+            refill(tags, [make('button', 'first'), make('button', 'second')]);
+            tags.lastChild.focus();
+            refill(tags, [make('button', 'first')]);
+            return document.activeElement.textContent; })""")
+            == "first"
+        ), "the last one has been deleted"
 
 
 def test_a_browser_is_asked_for_a_few_of_thousands_of_recordings_at_a_time(server, page):

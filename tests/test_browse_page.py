@@ -54,6 +54,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.press("Enter")
         page.wait("document.querySelectorAll('#plots .uplot').length == 4")
         at(page, 0)
+        assert page.text("h1 [role=status]") == "/ lake", "a screen reader tells what is open"
         assert page.run("getComputedStyle(document.querySelector('#replaying')).display") == "none", "without a model"
         for key, shift, row in (("ArrowRight", False, 1), ("ArrowRight", True, 16), ("ArrowLeft", True, 1),
                                 ("End", False, 59), ("f", False, 44), ("f", False, 8), ("Home", False, 0),
@@ -338,6 +339,8 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.wait("location.hash.includes('select=')")
         page.click("#merge")
         page.shows("#selection", "2 recordings as one: 61 frames")
+        named = "document.getElementById(each.getAttribute('aria-labelledby'))?.textContent.split(' ')[0]"
+        assert page.run(f"[...document.querySelectorAll('dialog')].map(each => {named}).join()") == "Cut,Export,Keys"
         assert page.barriers() == []
         page.run("document.querySelector('#export-name').value = 'both'")
         page.click("#export [value=recording]")

@@ -322,10 +322,15 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         files.report.write_text("<!doctype html>", encoding="utf-8")
         page.shows("#run-figures a", "report.html")
         assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<!doctype html>"
-        page.run("document.querySelector('#run-figures a').focus(); new Promise(go => setTimeout(go, 15000))")
+        page.run("""document.querySelector('#run-figures a').focus(); told = [];
+            const observer = new MutationObserver(all => told.push(...all.map(({target}) => target.id)));
+            document.querySelectorAll('output, [role]').forEach(each => observer.observe(each, {childList: true}));
+            new Promise(go => setTimeout(go, 15000))""")
         assert page.run("document.activeElement.textContent") == "report.html", "though the page has asked again"
+        assert page.run("told") == [], "nothing is read out again"
         page.click("#run-others button")
         page.shows("#losses", "b drift")
+        assert page.run("getComputedStyle(document.querySelector('.u-marker')).forcedColorAdjust") == "none"
         assert page.run("location.hash") == "#/run/0?with=1"
         page.run("smooth.value = 0.5; smooth.oninput(); smooth.onchange()")
         page.wait("location.hash == '#/run/0?with=1&smooth=0.5'")

@@ -294,6 +294,8 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.shows("#plots", "set speed 9.5 mph")
             page.shows("#record", "Record")
             page.press(" ")
+            page.shows("#record", "Stop recording")
+            assert page.run("record.ariaPressed") is None, "else one might take it for having stopped"
             page.shows("#saving", "frames saved in run 1-2")
             page.shows("#film", "python video.py 'run 1-2'")
             page.shows("#convert", "python -m cloning.lerobot 'run 1-2' --output 'run 1-2-recording'")

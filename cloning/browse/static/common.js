@@ -1,6 +1,6 @@
 // What all parts of the page use.
-import {element, make, palette} from "/site/site.js";
-export {element, make, palette};
+import {element, make, palette, write} from "/site/site.js";
+export {element, make, palette, write};
 
 // A request's JSON, or bytes if `binary`. What is thrown has the server's message.
 export const ask = (path, options) => request(`/recordings${path}`, options);
@@ -28,7 +28,7 @@ export async function askAll(things, question) {
 }
 
 export function notice(message = "") {
-  if (element("notice").textContent != message) element("notice").textContent = message; // else it is read out again
+  write("notice", message);
   element("notice").hidden = !message;
 }
 
@@ -85,10 +85,10 @@ export function renew(holder, content, build) {
   refill(holder, build());
 }
 
-// Give an element new children. A focus in them stays: on what has the same index.
+// Give an element new children. A focus in them stays: on what has the same index, or is the last one.
 export function refill(holder, children) {
   const all = () => [...holder.querySelectorAll("a, button, input, [tabindex]")];
   const focused = all().indexOf(document.activeElement);
   holder.replaceChildren(...children);
-  all()[focused]?.focus();
+  if (focused >= 0) (all()[focused] ?? all().at(-1))?.focus();
 }

@@ -1,5 +1,5 @@
 // Several recordings and several models in one table: how they were driven, and how the models steer and drive there.
-import {ask, askAll, element, make, makeButton, many, notice, renew} from "./common.js";
+import {ask, askAll, element, make, makeButton, many, notice, renew, write} from "./common.js";
 import {LIMITS, waits} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
@@ -54,7 +54,7 @@ async function refresh(now, method) {
   const states = models.flatMap(({steering, replay}) => [steering.state, replay.state]);
   const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
   element("compare-all").hidden = !(count("none") + count("paused") + count("failed"));
-  element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
+  write("compared", pending ? `${many(pending, "analysis", "analyses")} to do` : "");
   renew(element("table"), [now.limit, found], () => table(found, now.limit));
   if (pending) again();
 }

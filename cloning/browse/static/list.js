@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, askAll, element, histogram, make, makeButton, many, notice, refill, renew, request} from "./common.js";
+import {ask, askAll, element, histogram, make, makeButton, many, notice, refill, renew, request, write} from "./common.js";
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
@@ -88,9 +88,9 @@ function arrange() {
   });
   const all = order.filter(([card]) => !card.hidden).map(([, overview]) => overview);
   const sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0), cut = sum("cut_frames");
-  element("total").textContent = (all.length < known.size ? `${all.length} of ` : "") + many(known.size, "recording") +
+  write("total", (all.length < known.size ? `${all.length} of ` : "") + many(known.size, "recording") +
     `, ${many(sum("frames"), "frame")}, ${(sum("seconds") / 60).toFixed(1)} minutes` +
-    (cut ? `, ${many(cut, "frame")} cut` : "");
+    (cut ? `, ${many(cut, "frame")} cut` : ""));
   element("compare").disabled = !all.length;
   element("merge").disabled = together().length < 2;
   const state = new URLSearchParams({

@@ -1,6 +1,6 @@
 // A training run: how far it is, its drift and losses beside other runs', and the pictures of what it trains on; it
 // refreshes itself.
-import {element, make, makeButton, many, notice, palette, renew, request} from "./common.js";
+import {element, make, makeButton, many, notice, palette, renew, request, write} from "./common.js";
 import {MODEL_COLOURS, most} from "./plots.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
@@ -93,7 +93,7 @@ async function refresh(now) {
 function update({all, runs}) {
   const now = open, before = now.runs, [run] = runs, {history} = run, last = history.at(-1);
   Object.assign(now, {run, runs});
-  element("title").textContent = `/ training run in ${run.name}`;
+  write("title", `/ training run in ${run.name}`);
   document.title = `${run.state}: ${run.name}`;
   const done = history.length + Math.min(1, run.images / run.samples_per_epoch);
   element("run-bar").value = run.state == "finished" ? 1 : Math.min(1, done / run.epochs);
@@ -214,8 +214,8 @@ function showPictures() {
   const {run, at, id} = open, {pictures} = run, shown = pictures.includes(at) ? at : pictures.at(-1);
   element("run-earlier").disabled = !pictures.length || shown == pictures[0];
   element("run-later").disabled = !pictures.length || shown == pictures.at(-1);
-  element("run-which").textContent = shown == undefined ? "No picture yet."
-    : `after ${many(shown, "observation")} (${pictures.indexOf(shown) + 1} of ${pictures.length})`;
+  write("run-which", shown == undefined ? "No picture yet."
+    : `after ${many(shown, "observation")} (${pictures.indexOf(shown) + 1} of ${pictures.length})`);
   element("run-pictures").hidden = shown == undefined;
   PICTURES.forEach((name, index) => {
     const [picture, caption] = element("run-pictures").children[index].children;

@@ -1,5 +1,5 @@
 // The page of drive.py: what it does in words, its figures, and curves of the last minute.
-import {element, make, palette, rounded} from "./site.js";
+import {element, make, palette, rounded, write} from "./site.js";
 
 const {seconds, topSpeed, limits} = element("plots").dataset;
 const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.parse(limits); // s, mph, m
@@ -41,13 +41,6 @@ let moved = -HOLD, offered; // ms, when the slider was moved last; mph that the 
 // ---------------------------------------------------------------------------------------------------------------------
 // Words and figures
 
-// Give an element a text and a class, unless it has them: the browser would make new nodes.
-function write(id, words, look = "") {
-  const shown = element(id);
-  if (shown.textContent != words) shown.textContent = words;
-  if (shown.className != look) shown.className = look;
-}
-
 function say(state) {
   if (element("head").dataset.state == state) return;
   const [words, advice] = WORDS[state];
@@ -78,8 +71,7 @@ function showFigures({rate, frames, unusable, reason, saving, film, convert, bro
   write("frames", frames ?? "–");
   write("unusable", unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–", unusable ? "bad" : "");
   write("saving", saving || (recording ? "begins with the first frame" : "no"));
-  element("record").setAttribute("aria-pressed", recording);
-  write("record", recording ? "Stop recording" : "Record");
+  write("record", recording ? "Stop recording" : "Record", recording ? "on" : "");
   for (const each of document.querySelectorAll(".saved")) each.hidden = !film;
   for (const [id, command] of Object.entries({film, convert, browse})) write(id, command ?? "");
   element("plots").hidden = !rows.length;

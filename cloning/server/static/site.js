@@ -10,6 +10,13 @@ export function make(name, text = "", attributes = {}, ...children) {
   return made;
 }
 
+// Give an element a text and a class, unless it has them: it would be read out again, and have new nodes.
+export function write(id, words, look = "") {
+  const shown = element(id);
+  if (shown.textContent != words) shown.textContent = words;
+  if (shown.className != look) shown.className = look;
+}
+
 // The page's colours, by their custom properties, and with them the looks of an axis of uPlot.
 export function palette() {
   const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
