@@ -133,6 +133,20 @@ def test_a_browser_is_asked_for_a_few_of_thousands_of_recordings_at_a_time(serve
         assert page.run("most") == 6
 
 
+def test_a_recording_that_was_left_is_forgotten(server, page):
+    page.open(server.base)
+    listeners = []
+    for _ in range(3):
+        page.run(f"location.hash = '{server.hash('lake')}'")
+        page.wait("document.querySelectorAll('#plots .uplot').length == 4")
+        page.drag("#plots .u-over", 0.5, 0.5)
+        page.run("location.hash = '#'")
+        page.wait("document.querySelector('article .road')")
+        page.send("HeapProfiler.collectGarbage")
+        listeners.append(page.send("Memory.getDOMCounters")["jsEventListeners"])
+    assert listeners[2] - listeners[1] < 20, listeners
+
+
 def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(server, linked, page):
     cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
     cuts.write_text("spoilt\n", encoding="utf-8")
@@ -153,6 +167,12 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(server,
     assert page.run("document.querySelector('#recording').hidden")
     cuts.unlink()
     at(page, 7)
+    page.run("own = fetch; fetch = async path => { if (path.match(/rows.\\d+.v/)) throw path; return own(path); }; 0")
+    asks_why(page, "i", "o", "x")
+    page.press("Enter")
+    page.shows("#notice", "does not answer")
+    page.run("fetch = own; 0")
+    page.wait("document.querySelector('#notice').hidden")
     linked.rename(elsewhere)
     page.shows("#notice", "driving_log.csv: No such file")
     page.press("End")

@@ -2,6 +2,8 @@
 import {element, make, palette, write} from "/site/site.js";
 export {element, make, palette, write};
 
+export const LOST = "The program that shows the recordings does not answer: start it again.";
+
 // A request's JSON, or bytes if `binary`. What is thrown has the server's message.
 export const ask = (path, options) => request(`/recordings${path}`, options);
 
@@ -10,7 +12,7 @@ export async function request(path, {binary = false, ...options} = {}) {
   try {
     answer = await fetch(path, options);
   } catch (error) {
-    throw new Error("The program that shows the recordings does not answer: start it again.");
+    throw new Error(LOST);
   }
   if (!answer.ok) {
     const {message} = await answer.json().catch(() => ({message: `${answer.status} ${answer.statusText}`}));

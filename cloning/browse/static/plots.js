@@ -21,14 +21,11 @@ export class Plots {
     this.rows = Array.from({length: this.count}, (_, row) => row);
     this.resizing = new ResizeObserver(() => this.fit());
     this.resizing.observe(element("plots"));
-    const release = () => setTimeout(() => { // after the plot has heard of it
+    element("plots").onpointerdown = () => this.held = true;
+    window.onpointerup = window.onpointercancel = () => setTimeout(() => { // after the plot has heard of it
       this.held = false;
       if (this.late) this.build();
     });
-    element("plots").onpointerdown = () => {
-      this.held = true;
-      for (const ended of ["pointerup", "pointercancel"]) addEventListener(ended, release, {once: true});
-    };
     this.build();
   }
 

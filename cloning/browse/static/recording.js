@@ -1,5 +1,5 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
-import {ask, element, make, makeButton, many, notice, onClick, renew, request} from "./common.js";
+import {LOST, ask, element, make, makeButton, many, notice, onClick, renew, request} from "./common.js";
 import {changes, cutMarked, mark, redo, showCuts, showStretches, undo} from "./cuts.js";
 import {askToExport, find, setCondition, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
@@ -143,7 +143,7 @@ async function refresh(now, known) {
     const {orders} = now, details = known ?? await ask(`/${now.id}/details${now.query()}`);
     if (page.open != now) return;
     if (now.orders != orders) return refresh(now); // asked before the last change, so it may not tell of it
-    if (now.lost) {
+    if (now.lost || element("notice").textContent == LOST) { // which a change may have told of
       notice();
       now.frames.show(now.row);
     }
