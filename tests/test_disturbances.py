@@ -250,6 +250,7 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(sample_recording
     file = tmp_path / "found" / "robustness.json"
     found = json.loads(file.read_text(encoding="utf-8"))
     assert len(found) == 6 and all(name.startswith("shipped ") for name in found)
+    assert all(f", rules {robustness.VERSION}, " in name for name in found), "what others gave is driven anew"
 
     def of(words):
         return next(name for name in found if name.endswith(words))

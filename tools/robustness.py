@@ -41,6 +41,7 @@ from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import driving
 from simulator.benchmark.replays import driver_of
+from simulator.benchmark.tasks import VERSION
 from simulator.driving import Conditions
 from simulator.run import Run
 from simulator.workers import add_workers, started_workers
@@ -69,7 +70,7 @@ class Drive(NamedTuple):
     def __str__(self) -> str:
         how = self.conditions
         course = f" {how.direction}, {how.speed:g} mph, look {how.look}, {self.laps:g} laps" * bool(self.laps)
-        return f"{self.name} {self.sha256[:16]}, {self.on}{course}, {how.disturbance or 'clear'}"
+        return f"{self.name} {self.sha256[:16]}, rules {VERSION}, {self.on}{course}, {how.disturbance or 'clear'}"
 
 
 class Figures(NamedTuple):
