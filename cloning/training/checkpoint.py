@@ -350,7 +350,8 @@ class Checkpoint:
             return Progress()
         state, self.resumed = begin.contents["training"], True
         if state.get("fingerprint") not in self.fingerprints:
-            raise ModelError(f"{self.files.resume}: the run began with other recordings; restore them, or {NEW_RUN}")
+            began = "the run began with other recordings, or by a version that reads them otherwise"
+            raise ModelError(f"{self.files.resume}: {began}; restore them, or {NEW_RUN}")
         try:
             _restore_network(self.network, begin.contents)
             self._restore_optimizer(state.get("optimizer"), has_begun=begin.progress.number > 0)
