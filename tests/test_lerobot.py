@@ -442,3 +442,5 @@ def test_a_drive_that_was_saved_becomes_a_recording(tmp_path):
     assert cv2.absdiff(read_frame(recording.path(2)), read_frame(sorted(drive.glob("*.jpg"))[2])).mean() < 2
     (drive / "driven.csv").write_text("name,angle\n", encoding="utf-8")
     assert "driven.csv: line 1: not frame,steering" in refused(drive, "--output", tmp_path / "again")
+    (drive / "driven.csv").unlink()
+    assert "run1: saved frames without driven.csv, as" in refused(drive, "--output", tmp_path / "again")

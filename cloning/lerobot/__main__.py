@@ -25,7 +25,7 @@ from cloning.lerobot.source import write_recording
 from cloning.recordings.check import check_images
 from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import find_folders, folders_below, print_findings, read_recording
-from cloning.recordings.saved_frames import DRIVEN
+from cloning.recordings.saved_frames import DRIVEN, taken_at
 
 OPTIONS = {"camera": ("data set", "tub"), "steering": ("data set",), "full_lock": ("data set", "tub")}  # of what
 
@@ -79,6 +79,9 @@ def main() -> int:
         from cloning.lerobot.reader import read_data_set
 
         if kind == "recording":
+            if any(taken_at(path.name) for path in source.glob("[0-9]*.jpg")):
+                why = f"saved frames without {DRIVEN}, as earlier versions and Udacity's drive.py leave them"
+                raise UserError(f"{source}: {why}, so their steering is unknown; `python video.py` films them")
             inner = [str(folder) for folder in sorted(source.glob("*")) if kind_of(folder) in ("tub", "data set")]
             if inner and not any(folders_below(source)):
                 raise UserError(f"{source}: name one alone: {', '.join(inner)}")
