@@ -255,7 +255,7 @@ def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, netw
     assert foretell.limits_file(model).stat().st_size < 200_000
     assert foretell.load_limits(model, Network().eval()) is None, "another network has no figure"
     foretell.save_limits(model, network, limits._replace(weights=limits.weights[:-1]))
-    with pytest.raises(ModelError, match=r"model.limits.pt: .*python -m tools.foretell '.*model.pt'"):
+    with pytest.raises(ModelError, match=r"model.limits.pt: .*; delete it, or .*python -m tools.foretell '.*model.pt'"):
         foretell.load_limits(model, network)
 
 

@@ -218,7 +218,7 @@ def load_limits(model: Path, network: Network) -> Limits | None:
     Raises ModelError for a file that is damaged.
     """
     path, command = limits_file(model), as_typed("python", "-m", "tools.foretell", model)
-    remedy = f"measure the network again: `{command}`"
+    remedy = f"delete it, or measure the network again: `{command}`"
     if not path.exists():
         return None
     saved = tensors.load(path, remedy)
