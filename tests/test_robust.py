@@ -214,6 +214,7 @@ def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_pa
     after = torch.load(tmp_path / "model-resume.pt", weights_only=True)
     recipe = after["arguments"]["recipe"]
     assert [recipe[name] for name in ("name", "optimizer", "momentum", "huber")] == ["robust", "adam", 0.9, None]
+    assert recipe["exposure"] == [0.0, 0.0], "dark frames are none other to it"
     assert all("exp_avg_sq" in state for state in after["training"]["optimizer"]["state"].values())
 
 

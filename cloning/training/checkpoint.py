@@ -196,6 +196,7 @@ def _saved_run(contents: dict[str, Any], recipes: Mapping[str, Recipe]) -> Run:
         raise ValueError(f"its --seed is of type {type(seed).__name__}")
     if type(from_model) is not str:
         raise ValueError(f"its --from is of type {type(from_model).__name__}")
+    figures = {"exposure": (0.0, 0.0)} | figures  # earlier versions' networks had none
     return Run(recipes[name].restored(figures), tuple(recordings), seed, from_model)
 
 
