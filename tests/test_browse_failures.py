@@ -212,6 +212,9 @@ def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_show
     page.press("z")
     page.shows("#cuts", "None")
     assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
+    page.run("element = document.querySelector('#condition'); element.value = 'speed >= 0'; element.oninput()")
+    page.wait("document.querySelector('#matches').textContent.includes('frames')")
+    left = int(page.run("document.querySelector('#matches').textContent").split()[0])
     cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
     file.write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
     key = f"cuts-{server.hash('lake').removeprefix('#/')}"
@@ -219,8 +222,10 @@ def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_show
     page.run(f"localStorage.setItem('{key}', JSON.stringify({json.dumps(kept)}))")
     page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
     page.shows("#cuts", "2 frames: off")
+    page.shows("#matches", f"{left - 2} frames")
     page.press("z")
     page.shows("#cuts", "None")
+    page.shows("#matches", f"{left} frames")
 
 
 def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):

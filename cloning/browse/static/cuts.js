@@ -1,8 +1,7 @@
 // Marking stretches, cutting them from a recording or tagging them, and undoing it; what can be undone survives leaving the page.
 import {ask, clock, element, make, many, notice, renew, sending, told} from "./common.js";
-import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
-import {page, remember, say} from "./state.js";
+import {marked, page, remember, say} from "./state.js";
 
 const OPPOSITE = {POST: "DELETE", DELETE: "POST"}, GONE = 410; // the status of an answer
 let storage; // undefined where the browser refuses it, as with all cookies blocked: undoing ends with the page there
@@ -26,12 +25,6 @@ export function showCuts() {
     renew(element(kind), [now.id, details.version, some], () =>
       some.length ? some.map(item) : [make("li", `None. ${none}`, {class: "quiet"})]);
   }
-}
-
-// The marked stretch: [first row, row after the last], or undefined.
-export function marked() {
-  const {first, last} = page.open.marks;
-  return first == undefined || last == undefined ? undefined : [first, last + 1];
 }
 
 // What is cut, found and marked, behind the curves and on the strip.
@@ -122,7 +115,6 @@ async function act(now, kind, method, cuts, what, from = "") {
     const back = from || !changed.length ? "" : " Undo takes it back.";
     say(`${what}: ${changed.length ? many(changed.length, "stretch", "stretches") : "nothing that was not so before"}.${back}`);
     await now.update(details);
-    find();
   } catch (error) {
     notice(error.message);
     if (!from || error.status != GONE) return;

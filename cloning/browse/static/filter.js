@@ -1,8 +1,8 @@
 // Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
 import {ask, element, histogram, make, many, renew} from "./common.js";
-import {askForReason, marked, showStretches} from "./cuts.js";
+import {askForReason, showStretches} from "./cuts.js";
 import {askForName} from "./export.js";
-import {page, remember, say} from "./state.js";
+import {marked, page, remember, say} from "./state.js";
 
 const SOON = 300, BINS = 60, [WIDTH, HEIGHT] = [270, 52]; // ms after the last letter; of the histogram, and its px
 let typing, plot;

@@ -1,7 +1,6 @@
 // Moving through a recording: to a row, by playing, and to the rows worth watching.
 import {clock, element} from "./common.js";
-import {marked} from "./cuts.js";
-import {page, remember, say} from "./state.js";
+import {marked, page, remember, say} from "./state.js";
 
 const PAUSE = 0.07; // s that the last frame is shown before they are played again
 

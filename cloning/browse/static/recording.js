@@ -115,6 +115,7 @@ async function update(details) {
     remember();
     return notice(CHANGED);
   }
+  const areCutsNew = JSON.stringify(details.cuts) != JSON.stringify(now.details.cuts); // perhaps elsewhere
   now.details = details;
   const stamps = stampsOf(details), changed = Object.keys(stamps).filter(name => stamps[name] != now.stamps[name]);
   for (const name of changed) now.columns[name] = stamps[name] && await now.column(name);
@@ -128,7 +129,7 @@ async function update(details) {
   now.hasHistogram = true;
   const areReplaysNew = await showReplays();
   if (page.open != now) return;
-  if (changed.length || areReplaysNew) find();
+  if (changed.length || areReplaysNew || areCutsNew) find();
   showCuts();
   showFindings();
   buttons();

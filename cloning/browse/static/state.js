@@ -5,6 +5,12 @@ import {ask, element, makeButton, notice} from "./common.js";
 // makes it; `update(details)` shows what the server answers, and `orders` counts the changes that it has answered.
 export const page = {open: undefined};
 
+// The marked stretch: [first row, row after the last], or undefined.
+export function marked() {
+  const {first, last} = page.open.marks;
+  return first == undefined || last == undefined ? undefined : [first, last + 1];
+}
+
 export function say(text) {
   element("said").textContent = text;
 }
