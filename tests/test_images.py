@@ -85,6 +85,7 @@ def with_scans(count: int) -> bytes:
         (PLAIN[:HEADER] + PLAIN[SCAN:], "no picture in it"),
         (PLAIN[:SCAN] + b"\xff\xd9", "no picture in it"),
         (PLAIN.replace(b"\xff\xdb", b"\xff\xfe"), "damaged"),  # without quantization tables
+        (PLAIN[:-3000] + bytes(512) + PLAIN[-2488:], "damaged: zeros in the middle of it"),
         (cv2.imencode(".png", FRAME)[1].tobytes(), "not a JPEG but a PNG"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS: run `git lfs pull`"),
     ],

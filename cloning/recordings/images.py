@@ -13,7 +13,7 @@ from cloning.base.errors import RecordingError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import LFS_POINTER, NOT_PULLED
 
-RULES = 2  # of what a usable image is: counted up when they change, because `check_images` keeps its results
+RULES = 3  # of what a usable image is: counted up when they change, because `check_images` keeps its results
 MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of it
 MAX_SEGMENTS = 100  # a camera's JPEG has 10
 MAX_SCANS = 20  # a progressive JPEG usually has 10; each one may take as long as the whole frame
@@ -24,6 +24,7 @@ SCAN_HEADER = 0xDA
 OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
 REMEDY = "put the right JPEG in its place, or delete the row"  # for an image that is missing or unusable
 OTHER_KINDS = {b"\x89PNG": " but a PNG", LFS_POINTER: f" but {NOT_PULLED}"}
+EMPTIED = bytes(512)  # a disk's sector after a power failure; a scan of the simulator's has 6 zeros at most
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
 
 
@@ -72,6 +73,8 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
             if not following:
                 raise ValueError("cut short")
             end = following.start()
+            if jpeg.find(EMPTIED, at, end) >= 0:
+                raise ValueError("damaged: zeros in the middle of it")
         at = end
     if size is None or not scans:
         raise ValueError("no picture in it")
