@@ -139,9 +139,12 @@ def versions() -> dict[str, str]:
 
 def load_checkpoint(path: str | Path, remedy: str = "`python model.py` trains a model") -> dict[str, Any]:
     """Return the contents of a model file, read without running code from it. Raises ModelError, with the remedy."""
-    if kind := FOREIGN.get(Path(path).suffix):
-        raise ModelError(f"{path}: a model of {kind}, which PyTorch can't read; {remedy}")
-    saved = tensors.load(path, remedy)
+    try:
+        saved = tensors.load(path, remedy)
+    except ModelError:
+        if (kind := FOREIGN.get(Path(path).suffix)) and Path(path).is_file():  # else of this project, by such a name
+            raise ModelError(f"{path}: a model of {kind}, which PyTorch can't read; {remedy}") from None
+        raise
     if saved.get("format") != FORMAT:
         raise ModelError(f"{path}: not a model of this project; {remedy}")
     version = saved.get("version")
