@@ -119,18 +119,28 @@ def test_the_focus_stays_on_a_recording_while_its_road_is_looked_for(linked, pag
 def test_a_browser_is_asked_for_a_few_of_thousands_of_recordings_at_a_time(server, page):
     page.open(server.base)
     page.shows("#total", "1 recording")
-    page.run("""busy = most = 0; own = fetch; fetch = async path => {
-        if (!path.startsWith('/recordings')) return own(path);
+    page.run("""busy = most = begun = 0; own = fetch; paused = false; fetch = async (path, {method} = {}) => {
+        if (path == '/analyses') paused = true;
+        else if (!path.startsWith('/recordings')) return own(path);
+        if (paused && path.includes('/9/overview')) location.hash = '#/compare';
+        begun += method == 'POST';
         most = Math.max(most, ++busy);
         await new Promise(done => setTimeout(done));
         busy -= 1;
-        return Response.json(path != '/recordings' ? {name: path, message: 'spoilt'}
+        const [, , id] = path.split('/');
+        return Response.json(id ? {id, name: id, message: 'spoilt', lane: {state: 'waiting'}}
             : Array.from({length: 200}, (_, id) => ({id, folder: ''})));
     }; 0""")
     for place, shown in (("#/compare", "#table tbody tr"), ("#", "article .bad")):
         page.run(f"most = 0; location.hash = '{place}'")
         page.wait(f"document.querySelectorAll('{shown}').length == 200")
         assert page.run("most") == 6
+    page.run("document.querySelector('#analysing button').click()")
+    page.wait("!document.querySelector('#comparison').hidden")
+    page.run("paused = false; document.querySelector('#compare-all').click(); location.hash = '#'")
+    page.shows("#total", "200 recordings")
+    page.wait("begun == 200")
+    assert page.run("document.querySelectorAll('article').length") == 200, "none of the list that was left"
 
 
 def test_a_recording_that_was_left_is_forgotten(server, page):

@@ -40,7 +40,8 @@ async function refresh(now, method) {
   const again = () => now.timer = setTimeout(() => refresh(now, "GET"), AGAIN);
   let found;
   try {
-    found = await askAll(now.ids, id => open == now && ask(`/${id}/compared?limit=${now.limit}`, {method}));
+    found = await askAll(now.ids, id => (method == "POST" || open == now && now.asking == mine) &&
+      ask(`/${id}/compared?limit=${now.limit}`, {method}));
   } catch (error) {
     if (open != now || now.asking != mine) return;
     now.lost = true;

@@ -104,7 +104,7 @@ function arrange() {
     const title = "Pause the analyses of all recordings, or go on with them";
     const button = makeButton(isPaused ? "Go on" : "Pause", {title}, () =>
       request("/analyses", {method: isPaused ? "POST" : "DELETE"})
-        .then(() => askAll([...known], ([card, {id}]) => fill(id, card, shown)))
+        .then((_, now = shown) => askAll([...known], ([card, {id}]) => now == shown && fill(id, card, now)))
         .catch(error => notice(error.message)));
     return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
   });
