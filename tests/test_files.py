@@ -30,7 +30,7 @@ def test_a_folder_is_refused_at_once(tmp_path, monkeypatch, name):
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
     (tmp_path / "report.json").symlink_to(tmp_path / "frozen" / "report.json")
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "frozen" or mode != os.W_OK)
-    with pytest.raises(OutputError, match=r"report\.json: this folder cannot be written; name a file in another one"):
+    with pytest.raises(OutputError, match=r"report\.json: its folder cannot be written; name a file in another one"):
         check_folders(str(tmp_path / "report.json"))
 
 

@@ -40,7 +40,7 @@ def check_folders(*paths: str | None, read: Iterable[str | Path | None] = ()) ->
         if Path(path).exists() and not Path(path).is_file():
             raise OutputError(f"{path}: is a device or a pipe; name a file")
         if not os.access(os.path.dirname(os.path.realpath(path)), os.W_OK):
-            raise OutputError(f"{path}: this folder cannot be written; name a file in another one")
+            raise OutputError(f"{path}: its folder cannot be written; name a file in another one")
 
 
 @contextlib.contextmanager
