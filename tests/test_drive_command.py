@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -90,6 +91,8 @@ def test_which_model_drives(jpegs, tmp_path, monkeypatch):
     for other, kind in (("model.h5", "Keras"), ("model.json", "Keras"), ("model.onnx", "ONNX")):
         with pytest.raises(UserError, match=f"{other}: a model of {kind}, .* LEADERBOARD.md tells how others"):
             drive.choose_model(Path(other), None)
+    shutil.copy(SHIPPED_MODEL, "model.h5")
+    assert drive.choose_model(Path("model.h5"), None) == Path("model.h5"), "as of `model.py --output model.h5`"
 
 
 @pytest.mark.parametrize("text", ["model.pt run1 --port 1", "model.pt --port 1 run1", "--port 1 model.pt run1"])
