@@ -67,9 +67,11 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
 def test_others_are_answered_while_thousands_of_runs_are_looked_at(tmp_path, monkeypatch):
     runs = Runs([tmp_path])
     monkeypatch.setattr(runs, "found", lambda: [threading.get_native_id()])
+    monkeypatch.setattr(runs, "run", lambda index: [threading.get_native_id()])
     with closing(Library([], [])) as library:
-        [thread] = create_app(library, runs).test_client().get("/runs").get_json()
-    assert thread != threading.get_native_id()
+        client = create_app(library, runs).test_client()
+        threads = [client.get(address).get_json() for address in ("/runs", "/runs/0")]  # either waits for the other
+    assert [threading.get_native_id()] not in threads
 
 
 def test_replays_and_runs_over_the_socket(served, sample_recording):

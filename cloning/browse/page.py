@@ -151,7 +151,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/runs/<int:index>")
     def run(index: int) -> dict[str, Any]:
-        return runs.run(index)
+        return eventlet.tpool.execute(runs.run, index)  # which waits where others look at the runs
 
     @app.get("/runs/<int:index>/report.html")
     def run_report(index: int) -> flask.Response:
