@@ -79,6 +79,7 @@ def test_the_report_contains_the_run(written, finished):
         assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
     encoded = re.findall(r'class="dark" src="data:image/svg\+xml;base64,([^"]*)', page)
     charts = [base64.b64decode(each).decode() for each in encoded]
+    assert page.count('" hidden>') == len(charts), "without styles, as in a mail, each chart is shown once"
     resampled = re.search(r"([\d,]+) observations after resampling", printed)
     assert "of 60 rows, as driven" in charts[0] and resampled and f"of {resampled[1]} for training" in charts[0]
     named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
