@@ -16,7 +16,6 @@ import gc
 import logging
 import reprlib
 import time
-import zipfile
 from collections import Counter
 from contextlib import suppress
 from datetime import datetime
@@ -291,10 +290,7 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
     usual = DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
     if argument is None:
         return usual
-    if (kind := FOREIGN.get(argument.suffix)) and not zipfile.is_zipfile(argument):  # as this project's are
-        remedy = "`python model.py` trains one that drives; LEADERBOARD.md tells how others can"
-        raise UserError(f"{argument}: a model of {kind}, which PyTorch can't read; {remedy}")
-    if folder is None and not argument.is_file() and argument.suffix not in (".pt", ".pth"):
+    if folder is None and not argument.is_file() and argument.suffix not in (".pt", ".pth", *FOREIGN):
         command = as_typed("python", "drive.py", usual, argument)
         raise UserError(
             f"{argument}: not a model file; name the model first and the folder for the frames second: `{command}`"

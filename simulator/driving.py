@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from cloning.base.arguments import MAX_PORT
-from cloning.base.errors import ModelError, SimulatorError, UserError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
 from cloning.base.outputs import as_typed
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
@@ -128,10 +128,7 @@ def load_driver(driver: str) -> Steering:
 def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since a file may be trained anew meanwhile
     if not driver.endswith(".onnx"):
         one_thread()
-        try:
-            network = load_model(driver)
-        except ModelError as error:
-            raise UserError(f"{error}; LEADERBOARD.md tells how others can drive") from None
+        network = load_model(driver)
         return lambda frame: float(steer(network, frame))
     try:
         onnxruntime = onnx_runtime()

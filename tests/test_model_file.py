@@ -83,7 +83,7 @@ def test_a_file_of_another_user_is_not_to_be_trained_anew(tmp_path, monkeypatch)
 
 def test_a_model_of_another_library_is_called_so(tmp_path):
     (tmp_path / "model.h5").write_bytes(b"\x89HDF\r\n")
-    refused(tmp_path / "model.h5", "a model of Keras, which PyTorch can't read")
+    refused(tmp_path / "model.h5", "a model of Keras, which PyTorch can't read; .*; LEADERBOARD.md tells how others")
     refused(tmp_path / "other.h5", "no such file")
     shutil.copy(SHIPPED_MODEL, tmp_path / "model.h5")
     assert load_model(tmp_path / "model.h5"), "as of `model.py --output model.h5`"

@@ -20,6 +20,7 @@ from cloning.network.fast_layers import BlockConv2d, elu
 VERSION = 1  # of the model file
 # By the endings of files that other projects' drive.py takes, and of those that cloning.network.export makes.
 FOREIGN = {".h5": "Keras", ".hdf5": "Keras", ".keras": "Keras", ".json": "Keras", ".onnx": "ONNX"}
+OTHERS = "LEADERBOARD.md tells how others can drive"
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
 PREPROCESSING = "recipe"  # the key of frame, colour, crop, scale, offset and exposure in the file
 COLOUR = "RGB"  # order of a frame's colours
@@ -143,10 +144,10 @@ def load_checkpoint(path: str | Path, remedy: str = "`python model.py` trains a 
         saved = tensors.load(path, remedy)
     except ModelError:
         if (kind := FOREIGN.get(Path(path).suffix)) and Path(path).is_file():  # else of this project, by such a name
-            raise ModelError(f"{path}: a model of {kind}, which PyTorch can't read; {remedy}") from None
+            raise ModelError(f"{path}: a model of {kind}, which PyTorch can't read; {remedy}; {OTHERS}") from None
         raise
     if saved.get("format") != FORMAT:
-        raise ModelError(f"{path}: not a model of this project; {remedy}")
+        raise ModelError(f"{path}: not a model of this project; {remedy}; {OTHERS}")
     version = saved.get("version")
     if type(version) is not int or version != VERSION:
         raise ModelError(
