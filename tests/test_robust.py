@@ -289,10 +289,13 @@ def test_tints_keep_grey_nearly_grey():
     assert paler.min() < 0.2 and paler.max() > 1.4
 
 
-def test_shadows_darken_parts_of_some_images():
+def test_shadows_darken_parts_of_some_images_and_as_many_are_disturbed_as_asked():
     shades = light.sample_shades(ROBUST.shaded, np.random.default_rng(0), 3000)
     assert (shades >= 0).mean() == pytest.approx(ROBUST.shaded, abs=0.03)
     assert shades.min() == -1 and shades.max() == light.SHADES - 1
+    disturbances = light.sample_disturbances(0.4, np.random.default_rng(0), 3000)
+    assert (disturbances >= 0).mean() == pytest.approx(0.4, abs=0.03)
+    assert set(map(light.name_of, disturbances)) == {"", *map(str, light.TRAINED)}
     image = np.full(SEEN_SHAPE, 200, np.uint8)
     same = np.eye(3, dtype=np.float32)
     np.testing.assert_array_equal(light.relight(image, same, -1), image)

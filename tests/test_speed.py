@@ -38,12 +38,12 @@ def test_controller_settles_at_each_set_speed_and_is_not_wound_up_by_a_wait_or_a
 
 def test_a_set_speed_of_0_brakes_until_the_car_is_at_rest_and_never_drives_it_backwards():
     controller = SpeedController(9)
-    controller.throttle(9)
+    assert [controller.throttle(speed) for speed in (8, 50)] == pytest.approx([0.102, -1]), "as Udacity's"
     controller.set_speed = 0
     assert [controller.throttle(speed) for speed in (9, 6, 4, 4, 4.4, 2, 1, 0.4)] == [-1] * 7 + [0]
     assert controller.throttle(0.1) == controller.throttle(3) == 0, "nothing brakes a car that rolls so slowly"
     controller.set_speed = 9
-    assert controller.throttle(1) == pytest.approx(0.8, abs=0.02)
+    assert controller.throttle(1) == pytest.approx(0.1 * 8 + 0.002 * (1 + 8)), "50 mph have not wound it up"
     controller.set_speed = 0
     assert [controller.throttle(speed) for speed in (1.2, 1.1, 1.2)] == [-1, -1, 0], "where it stops on a slope"
 
