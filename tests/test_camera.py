@@ -16,6 +16,7 @@ def test_a_warped_frame_is_what_is_seen_from_there(pose):
     expected = plane(*pose)
     near = seen & (np.arange(160) > 72)[:, None]  # further away a pixel covers metres
     assert near[75:135].mean() > 0.82  # measured: 0.856 to 1
+    assert (made[:50] == 127).all(), "the sky"
     difference = np.abs(made.astype(int) - expected)[near]
     assert difference.mean() < 0.36 and np.percentile(difference, 99) < 4  # measured: 0.282, 3
 

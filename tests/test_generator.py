@@ -52,6 +52,8 @@ def generator(sample_recording, pool):
 
 def test_validation_is_a_fifth_in_stretches_of_two_seconds_over_the_whole_recording():
     everything = observations(np.zeros(2800), [recording(1400), recording(1400, "other", first=7e6)])
+    drive, seconds = everything.drives()
+    assert np.bincount(drive).tolist() == [1400, 1400] and seconds[[0, 1400]].tolist() == [0, 0]
     train, validation = split(everything, REPORT, seed=3)
     assert sorted([*train, *validation]) == list(range(2800))
     assert len(validation) / 2800 == pytest.approx(0.2, abs=0.02)

@@ -136,6 +136,9 @@ def test_a_recording_without_time_stamps_keeps_the_file_order(log):
     assert copied.repairs["a copy of other rows begins or ends here: taken for the start of another drive"] == [2, 6]
     many = [line.replace("43_", f"{second}_") for second in range(10, 60) for line in usual(first=100)]
     assert log(*many).repairs == {}
+    old, new = (line.replace("07_16_17_11_43", "12_31_23_59_59") for line in usual()[:2])
+    new_year = log(old, new.replace("2018_12_31_23_59_59", "2019_01_01_00_00_00"))
+    np.testing.assert_allclose(np.diff(new_year.time), 1.001, atol=1e-6)
     for wrong in ("2018_13_16", "2018_02_29", "2018_07_00"):
         found = log(*many, *usual()[:1], usual()[1].replace("2018_07_16", wrong))
         np.testing.assert_array_equal(found.lines, np.arange(1, 203))
