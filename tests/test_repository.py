@@ -90,9 +90,11 @@ def names_of(requirements: list[str]) -> set[str]:
 def test_every_requirement_is_listed_with_its_purpose_and_pinned():
     section = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Dependencies")[1].split("## ")[0]
     pinned = names_of((ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines())
-    for requirements in (PROJECT["project"]["dependencies"], *PROJECT["project"]["optional-dependencies"].values()):
+    extras = PROJECT["project"]["optional-dependencies"]
+    for requirements in (PROJECT["project"]["dependencies"], *extras.values()):
         for name in names_of(requirements):
             assert re.search(rf"\b{name}\b", section) and (name in pinned or name in NOT_INSTALLED), name
+    assert {each for each in pinned if re.match("types-|.*-stubs$", each)} <= names_of(extras["dev"])
 
 
 @pytest.mark.skipif(os.name == "nt" or not shutil.which("make"), reason="needs make and sh")
