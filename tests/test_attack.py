@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import DEFAULT, Mock
@@ -63,6 +63,16 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     assert "wrong" in attack.run(None, server, jpegs, other, SECONDS).faults()
     report = attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 100.0, 9.0, 1)
     assert report.faults(timely=False) == ["lost", "memory", "new car", "left open"]
+
+
+def test_a_start_that_takes_long_leaves_the_car_its_time(server, jpegs, expected, monkeypatch):
+    @contextmanager
+    def slowly():
+        time.sleep(0.2)
+        yield
+
+    monkeypatch.setattr(attack, "starting", slowly)
+    assert attack.run(None, server, jpegs, expected, 0.1).drive.answered
 
 
 def test_an_attack_that_fails_is_not_withstood(server, jpegs, expected):
