@@ -172,7 +172,7 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, copied, tmp_
     left = sorted((copied / "IMG").glob("left*"))
     shutil.copy(left[0], left[1])  # a side image alone
     for changed in (other, copied):
-        assert "with other recordings, or by a version that reads them otherwise; re" in refused(changed, *resume)
+        assert ", or on a processor or by a version that reads them otherwise; re" in refused(changed, *resume)
     assert "record more" in refused(few, *resume)
     assert rejected.read_text(encoding="utf-8") == "the run's"
     with edited(begun / "model-resume.pt") as saved:
@@ -204,7 +204,9 @@ def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun, sample_r
     The side images were not in its fingerprint.
     """
     _, training, validation, _ = model.prepare(model.options.parse([str(sample_recording)], REPORT, model.ROBUST))
-    _, fingerprint = model.fingerprints(training, validation)
+    first, *_, fingerprint = model.fingerprints(training, validation)
+    other_processor = replace(training, steering=np.nextafter(training.steering, np.float32(1)))
+    assert model.fingerprints(other_processor, validation)[0] == first
     for name in ("model", "model-best", "model-resume"):
         with edited(begun / f"{name}.pt") as saved:
             del saved["run"], saved["layers"], saved["history"][0]["val_drift"]

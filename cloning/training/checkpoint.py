@@ -247,26 +247,27 @@ def _unusable(path: Path, error: ValueError) -> ModelError:
     return ModelError(f"{path}: its contents do not fit this program: {error}; {NEW_RUN}")
 
 
-def fingerprints(*observations: Observations) -> tuple[str, str]:
+def fingerprints(*observations: Observations) -> tuple[str, ...]:
     """Return a digest of a run's images and labels, which must not change before the run is resumed.
 
-    The second is that of an earlier version, which looked at the centre images alone.
+    Labels are rounded, as other processors compute other last bits of the recovery steering. The second and the third
+    are those of earlier versions: of the labels as they are, and of these with the centre images alone.
     """
-    digest = hashlib.blake2b(digest_size=16)
-    for part in observations:
-        digest.update(part.frame.tobytes() + part.steering.tobytes())
-    earlier = digest.hexdigest()
-    for part in observations:
-        for index, recording in enumerate(part.recordings):
-            images = recording.images[part.row[part.recording == index]]
-            digest.update(recording.digests[images].tobytes())
-    return digest.hexdigest(), earlier
+    images = b"".join(
+        recording.digests[recording.images[part.row[part.recording == index]]].tobytes()
+        for part in observations
+        for index, recording in enumerate(part.recordings)
+    )
+    labels = b"".join(np.rint(1000 * part.steering).astype(np.int16).tobytes() for part in observations)
+    exact = b"".join(part.frame.tobytes() + part.steering.tobytes() for part in observations)
+    every = (labels + images, exact + images, exact)
+    return tuple(hashlib.blake2b(data, digest_size=16).hexdigest() for data in every)
 
 
 class Checkpoint:
     """Writes the model files of a run, and restores the run from them."""
 
-    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data: tuple[str, str]):
+    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data: tuple[str, ...]):
         """network, optimizer: whose state is saved and restored; data: its `fingerprints`.
 
         Raises ModelError for a network that can't be saved whole, or sees other rows of a frame.
@@ -351,8 +352,8 @@ class Checkpoint:
             return Progress()
         state, self.resumed = begin.contents["training"], True
         if state.get("fingerprint") not in self.fingerprints:
-            began = "the run began with other recordings, or by a version that reads them otherwise"
-            raise ModelError(f"{self.files.resume}: {began}; restore them, or {NEW_RUN}")
+            began = "the run began with other recordings, or on a processor or by a version that reads them otherwise"
+            raise ModelError(f"{self.files.resume}: {began}; restore them, resume it there, or {NEW_RUN}")
         try:
             _restore_network(self.network, begin.contents)
             self._restore_optimizer(state.get("optimizer"), has_begun=begin.progress.number > 0)
