@@ -46,11 +46,11 @@ from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
-from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprints, resumed
+from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, resumed
 from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
-from cloning.training.observations import CameraViews, Choices, Observations, centre_images
+from cloning.training.observations import CameraViews, Choices, Data, Observations, centre_images
 from cloning.training.optimizers import OPTIMIZERS
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, write_losses
@@ -287,7 +287,7 @@ class TrainingRun:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
         self.predict = functools.partial(predict, precision=self.precision, pool=self.pool)
         self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
-        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprints(training, validation))
+        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, Data.of(training, validation))
         self.progress = self.checkpoint.restore(begin)
         self.generator = Generator(self.training, recipe, run.seed, self.pool, self.progress.number, ranks)
         self.validation_sets = recipe.validation_sets(self.validation, recipe, run.seed)

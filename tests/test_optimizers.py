@@ -13,6 +13,7 @@ import model
 from cloning.base.errors import ModelError
 from cloning.network.network import Network
 from cloning.training.checkpoint import METRICS, Checkpoint, Progress, read_saved_run
+from cloning.training.observations import Data
 from cloning.training.optimizers import Adam, Muon, orthogonal
 from cloning.training.options import Process, Run
 from cloning.training.recipe import LIMITS
@@ -47,6 +48,7 @@ def cropped_otherwise():
     return Network(crop=(40, 45))
 
 
+NO_DATA = Data(torch.zeros(1), [""])
 REFUSED = [(LargeNetwork, "too many"), (NormalizedNetwork, "batch norm"), (cropped_otherwise, r"by \(40, 45")]
 REFUSED += [(partly_frozen, "frozen")]
 
@@ -55,7 +57,7 @@ REFUSED += [(partly_frozen, "frozen")]
 def test_a_network_that_cannot_be_trained_or_saved_whole_is_refused_before(kind, words):
     network, process = kind(), Process("model.pt")
     with pytest.raises(ModelError, match=words):
-        Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), ("", ""))
+        Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), NO_DATA)
 
 
 def test_the_state_of_the_longest_run_can_be_resumed(tmp_path):
@@ -67,7 +69,7 @@ def test_the_state_of_the_longest_run_can_be_resumed(tmp_path):
     rows = ((epoch + 1, 128, *chance.random(4).tolist()) for epoch in range(most_epochs))
     history = [dict(zip(METRICS, row, strict=True)) for row in rows]
     progress = Progress(number=most_epochs, history=history, trail=chance.random(1999).tolist())
-    Checkpoint(Run(REPORT), Process(str(path)), network, adam, ("", "")).save(progress)
+    Checkpoint(Run(REPORT), Process(str(path)), network, adam, NO_DATA).save(progress)
     assert read_saved_run(tmp_path / "model-resume.pt", {"report": REPORT}).progress.history == history
 
 

@@ -172,12 +172,15 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, copied, tmp_
     left = sorted((copied / "IMG").glob("left*"))
     shutil.copy(left[0], left[1])  # a side image alone
     for changed in (other, copied):
-        assert ", or on a processor or by a version that reads them otherwise; re" in refused(changed, *resume)
+        assert "with other recordings, or by a version that reads them otherwise; re" in refused(changed, *resume)
     assert "record more" in refused(few, *resume)
     assert rejected.read_text(encoding="utf-8") == "the run's"
     with edited(begun / "model-resume.pt") as saved:
         saved["training"]["images"] = 4
     assert "the run is in epoch 2; give more --epochs" in refused(*resume, "--epochs", 1)
+    with edited(begun / "model-resume.pt") as saved:
+        saved["training"]["labels"][0] += 0.1
+    assert "with other recordings, or by a version" in refused(*resume, "--epochs", 2)
 
 
 def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path):
@@ -186,7 +189,9 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
     folder = tmp_path / "runs" / "a"
     with edited(folder / "model-resume.pt") as saved:
         assert not {"output", "device", "strict", "resume"} & saved["arguments"].keys()
-    trained("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
+        saved["training"]["labels"][0] += 0.01  # as on another processor
+    printed = trained("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
+    assert "labels differ by up to 0.01, as on another processor" in printed
     assert not (folder / "runs").exists()
     assert same(weights(folder / "model.pt"), weights(finished[1] / "model.pt"))
     arguments = json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))
@@ -204,9 +209,7 @@ def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun, sample_r
     The side images were not in its fingerprint.
     """
     _, training, validation, _ = model.prepare(model.options.parse([str(sample_recording)], REPORT, model.ROBUST))
-    first, *_, fingerprint = model.fingerprints(training, validation)
-    other_processor = replace(training, steering=np.nextafter(training.steering, np.float32(1)))
-    assert model.fingerprints(other_processor, validation)[0] == first
+    fingerprint = model.Data.of(training, validation).fingerprints[-1]
     for name in ("model", "model-best", "model-resume"):
         with edited(begun / f"{name}.pt") as saved:
             del saved["run"], saved["layers"], saved["history"][0]["val_drift"]
@@ -371,7 +374,7 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
-@pytest.mark.parametrize("function, advice", [("fingerprints", "start the run again"), ("write_losses", "--resume")])
+@pytest.mark.parametrize("function, advice", [("Checkpoint", "start the run again"), ("write_losses", "--resume")])
 def test_resume_is_recommended_only_once_the_new_run_has_a_state(
     begun, sample_recording, monkeypatch, error, function, advice
 ):

@@ -10,7 +10,6 @@ by the run's identifier in them: a killed run that is resumed never takes its ow
 copy that was made before the kill is not made again.
 """
 
-import hashlib
 import itertools
 import json
 import math
@@ -40,7 +39,7 @@ from cloning.network.network import (
 )
 from cloning.network.tensors import MAX_SIZE, MAX_STRUCTURE, matching, shown
 from cloning.recordings.format import BINS
-from cloning.training.observations import Observations
+from cloning.training.observations import Data
 from cloning.training.optimizers import Adam
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import write_losses
@@ -247,33 +246,17 @@ def _unusable(path: Path, error: ValueError) -> ModelError:
     return ModelError(f"{path}: its contents do not fit this program: {error}; {NEW_RUN}")
 
 
-def fingerprints(*observations: Observations) -> tuple[str, ...]:
-    """Return a digest of a run's images and labels, which must not change before the run is resumed.
-
-    Labels are rounded, as other processors compute other last bits of the recovery steering. The second and the third
-    are those of earlier versions: of the labels as they are, and of these with the centre images alone.
-    """
-    images = b"".join(
-        recording.digests[recording.images[part.row[part.recording == index]]].tobytes()
-        for part in observations
-        for index, recording in enumerate(part.recordings)
-    )
-    labels = b"".join(np.rint(1000 * part.steering).astype(np.int16).tobytes() for part in observations)
-    exact = b"".join(part.frame.tobytes() + part.steering.tobytes() for part in observations)
-    every = (labels + images, exact + images, exact)
-    return tuple(hashlib.blake2b(data, digest_size=16).hexdigest() for data in every)
-
-
 class Checkpoint:
     """Writes the model files of a run, and restores the run from them."""
 
-    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data: tuple[str, ...]):
-        """network, optimizer: whose state is saved and restored; data: its `fingerprints`.
+    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data: Data):
+        """network, optimizer: whose state is saved and restored.
 
         Raises ModelError for a network that can't be saved whole, or sees other rows of a frame.
         """
         averages = [optimizer.zeros(index).values() for index in range(len(optimizer.parameters))]
-        size = sum(tensor.nbytes for tensor in itertools.chain(network.state_dict().values(), *averages))
+        tensors = itertools.chain(network.state_dict().values(), *averages, [data.labels])
+        size = sum(tensor.nbytes for tensor in tensors)
         if size > MAX_SIZE - MAX_STRUCTURE:
             raise ModelError(f"the network's weights and their averages take {size:,} bytes, too many for a file")
         frozen = not all(parameter.requires_grad for parameter in network.parameters())
@@ -282,8 +265,9 @@ class Checkpoint:
         if network.crop != CROP:  # it would drive by other rows than those that it learns from
             raise ModelError(f"a network that crops frames by {network.crop}, not {CROP}, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
-        self.files, self.fingerprints = RunFiles(process.output), data
+        self.files, self.data = RunFiles(process.output), data
         self.resumed = False  # whether `restore` found a state of this run
+        self.changed = 0.0  # by how much its labels differed, at most
 
     def begin(self, progress: Progress, precision: torch.dtype, labels: np.ndarray) -> None:
         """Write training_arguments.json and, first, unless the run is resumed, its first state.
@@ -308,6 +292,8 @@ class Checkpoint:
                 print(f"the run has finished its {plural(len(progress.history), 'epoch')}; for more, raise --epochs")
             else:
                 print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
+            if self.changed:
+                print(f"labels differ by up to {self.changed:.2g}, as on another processor: so will the weights")
         elif self.run.from_model:
             print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
             print("it may have been trained on this run's validation frames: judge it by a recording that it never saw")
@@ -317,7 +303,8 @@ class Checkpoint:
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         position = {name: getattr(progress, name) for name in POSITION}
         position["trail"] = progress.trail
-        training = {"optimizer": {"state": self.optimizer.state}, **position, "fingerprint": self.fingerprints[0]}
+        data = {"fingerprint": self.data.fingerprints[0], "labels": self.data.labels}
+        training = {"optimizer": {"state": self.optimizer.state}, **position, **data}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
                 if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
@@ -351,9 +338,11 @@ class Checkpoint:
         if not isinstance(begin, SavedRun):
             return Progress()
         state, self.resumed = begin.contents["training"], True
-        if state.get("fingerprint") not in self.fingerprints:
-            began = "the run began with other recordings, or on a processor or by a version that reads them otherwise"
-            raise ModelError(f"{self.files.resume}: {began}; restore them, resume it there, or {NEW_RUN}")
+        try:
+            self.changed = self.data.changed(state.get("fingerprint"), state.get("labels"))
+        except ValueError:
+            began = "the run began with other recordings, or by a version that reads them otherwise"
+            raise ModelError(f"{self.files.resume}: {began}; restore them, or {NEW_RUN}") from None
         try:
             _restore_network(self.network, begin.contents)
             self._restore_optimizer(state.get("optimizer"), has_begun=begin.progress.number > 0)

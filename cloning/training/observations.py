@@ -1,6 +1,7 @@
 """Observations: the rows that training and validation use, their labels and images, and what a batch has of them."""
 
 import functools
+import hashlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from numpy.random import Generator
 from cloning.base.frame import ROAD_ROWS
 from cloning.base.table import Column, Table
 from cloning.network.network import SEEN_ROWS
+from cloning.network.tensors import matching
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import CheckedRecording
@@ -23,6 +25,7 @@ from cloning.training.lanes import Lanes
 from cloning.training.recipe import Recipe
 
 RESTORE = "the image was usable when the run began. Restore it and continue with --resume"
+SAME_LABELS = 0.03  # the most by which those of --robust differ on another processor, which rounds otherwise
 read_checked = functools.partial(read_frame, remedy=RESTORE)  # of a file that may have become unusable after the check
 
 
@@ -178,6 +181,41 @@ class Observations(Table):
         recording = self.recording[at]
         images = [self.recordings[r].images[i, c] for r, i, c in zip(recording, row, camera, strict=True)]
         return self.gpu.road(recording, np.array(images))
+
+
+class Data(NamedTuple):
+    """What a run learns from, by which --resume knows it again."""
+
+    labels: torch.Tensor  # float16 (n,), -1..1
+    # Digests: of all images; and as of earlier versions, with the labels, and of these and the centre's images alone.
+    fingerprints: list[str]
+
+    @classmethod
+    def of(cls, *observations: Observations) -> Self:
+        """Return what is in observations."""
+        images = b"".join(
+            recording.digests[recording.images[part.row[part.recording == index]]].tobytes()
+            for part in observations
+            for index, recording in enumerate(part.recordings)
+        )
+        frames = b"".join(part.frame.tobytes() for part in observations)
+        labelled = b"".join(part.frame.tobytes() + part.steering.tobytes() for part in observations)
+        digested = (frames + images, labelled + images, labelled)
+        labels = torch.from_numpy(np.concatenate([part.steering for part in observations])).half()
+        return cls(labels, [hashlib.blake2b(each, digest_size=16).hexdigest() for each in digested])
+
+    def changed(self, fingerprint: object, labels: object) -> float:
+        """Return by how much labels differ from those of a saved state, at most.
+
+        Raises ValueError if they are those of other recordings.
+        """
+        if fingerprint in self.fingerprints[1:]:
+            return 0.0
+        saved = matching({"labels": labels}, {"labels": self.labels})["labels"]
+        changed = float((saved.float() - self.labels.float()).abs().max())
+        if fingerprint != self.fingerprints[0] or changed > SAME_LABELS:
+            raise ValueError("other recordings")
+        return changed
 
 
 def centre_images(observations: Observations, recipe: Recipe, seed: int) -> list[ValidationSet]:
