@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import default_rng
-from torch import channels_last, nn
+from torch import nn
 
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
@@ -275,7 +275,7 @@ class TrainingRun:
         self.device, self.files = compute.choose_device(process.device), RunFiles(process.output)
         self.precision = compute.choose_precision(self.device)
         network = compute.seeded(run.seed, functools.partial(NETWORKS[recipe.network], exposure=recipe.exposure))
-        self.network = network.to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
+        self.network = compute.placed(network, self.device)
         compute.repeatable(self.device)
         compute.one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=compute.one_thread)

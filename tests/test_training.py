@@ -24,7 +24,7 @@ from steer_server import unused_port
 
 import model
 from cloning.base.errors import RecordingError, UserError
-from cloning.network.compute import choose_device
+from cloning.network.compute import choose_device, placed
 from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed, Ranks
@@ -284,10 +284,13 @@ def test_numpys_numbers_make_a_run_that_can_be_saved(monkeypatch):
         replace(REPORT, best_by="drift")
 
 
-def test_several_processes_leave_apples_gpu_alone(monkeypatch):
+def test_several_processes_leave_apples_gpu_alone_and_its_weights_are_contiguous(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert choose_device("auto").type == "mps"
+    for device, layout in (("mps", torch.contiguous_format), ("cpu", torch.channels_last)):
+        placed(network := Mock(), device)
+        assert network.to.call_args.kwargs["memory_format"] == layout
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert choose_device("auto").type == "cpu"
     with pytest.raises(UserError, match="--device mps: several processes"):

@@ -14,7 +14,7 @@ from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.network import FORMAT, tensors
-from cloning.network.compute import seeded
+from cloning.network.compute import placed, seeded
 from cloning.network.fast_layers import BlockConv2d, elu
 
 VERSION = 1  # of the model file
@@ -169,8 +169,7 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
         raise ModelError(
             f"{path}: its contents do not fit this project's network: {error}; train it again with `python model.py`"
         ) from None
-    network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-    return network.eval()
+    return placed(network, device).eval()
 
 
 def read_network(saved: dict[str, Any]) -> type[Network]:
