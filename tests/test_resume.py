@@ -6,7 +6,7 @@ import shutil
 import signal
 import sys
 from dataclasses import replace
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -371,6 +371,20 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
     assert [run.returncode for run in others] == [2, 2]
     assert all("another program writes there" in run.stderr for run in others)
     assert files(begun) == before
+
+
+def test_a_run_whose_folder_was_moved_and_made_anew_leaves_the_next_one_its_models(sample_recording, tmp_path):
+    command, validate = (sample_recording, *TINY, "--output", tmp_path / "run" / "model.pt"), model.TrainingRun.validate
+
+    def meanwhile(run):
+        os.rename(tmp_path / "run", tmp_path / "moved")
+        assert python("model.py", *command, "--seed", 1).returncode == 0
+        return validate(run)
+
+    with patch.object(model.TrainingRun, "validate", meanwhile):
+        told = refused(*command, "--seed", 2)
+    assert "model-resume.pt: now of another run, which goes on; start this one in another folder" in told
+    assert seeds(tmp_path / "run") == dict.fromkeys((f"{name}.pt" for name in MODELS), 1)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])

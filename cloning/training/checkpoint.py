@@ -268,6 +268,7 @@ class Checkpoint:
         self.files, self.data = RunFiles(process.output), data
         self.resumed = False  # whether `restore` found a state of this run
         self.changed = 0.0  # by how much its labels differed, at most
+        self._state: tuple[int, int] | None = None  # of model-resume.pt, as this run left it
 
     def begin(self, progress: Progress, precision: torch.dtype, labels: np.ndarray) -> None:
         """Write training_arguments.json and, first, unless the run is resumed, its first state.
@@ -278,6 +279,7 @@ class Checkpoint:
             if self.files.resume.exists() and _contents(self.files.resume).get("history") != []:
                 self.set_aside(self.files.resume)
             self.save(progress)
+        self._state = self.files.state()
         settings = {**self.run.saved(), **asdict(self.process), "precision": str(precision), "versions": versions()}
         counts, _ = np.histogram(labels, np.linspace(-1, 1, BINS + 1))
         settings["training"] = {"labels": counts.tolist()}
@@ -299,7 +301,15 @@ class Checkpoint:
             print("it may have been trained on this run's validation frames: judge it by a recording that it never saw")
 
     def save(self, progress: Progress, *models: Path) -> None:
-        """Write these models, then model-resume.pt with all that --resume needs, then how far it is. Raises OSError."""
+        """Write these models, then model-resume.pt with all that --resume needs, then how far it is.
+
+        Raises OSError, and ModelError if another run writes there now: it has no locks, or was moved and made anew.
+        """
+        has_changed = self._state not in (None, self.files.state()) and self.files.resume.exists()
+        if has_changed and _run_of(self.files.resume) != progress.run:
+            raise ModelError(
+                f"{self.files.resume}: now of another run, which goes on; start this one in another folder"
+            )
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         position = {name: getattr(progress, name) for name in POSITION}
         position["trail"] = progress.trail
@@ -312,6 +322,7 @@ class Checkpoint:
         for path in models:
             save_model(path, self.network, **more)
         save_model(self.files.resume, self.network, **more, training=training)
+        self._state = self.files.state()
         self._write_progress(progress)  # last, so that it never tells of more than --resume continues with
 
     def _write_progress(self, progress: Progress) -> None:
