@@ -164,6 +164,12 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
     return steering
 
 
+def refuse_replaced(driver: str, digest: object) -> None:
+    """Raise UserError if a driver's file is another than before: what drove since is neither the one nor the other."""
+    if digest and digest != digest_of(Path(driver)):
+        raise UserError(f"{driver}: was replaced while it drove, as by a training; name a copy of it")
+
+
 def load_limits_of(driver: str) -> tuple[Observer, Limits] | None:
     """Return what foretells that a model leaves the road, None if its limits are not known. Raises UserError."""
     if driver.endswith(".onnx"):

@@ -37,6 +37,7 @@ from simulator.benchmark.command import drive, drive_all, run
 from simulator.benchmark.tasks import Task
 from simulator.run import Departure
 from simulator.workers import started_workers
+from tools import robustness
 
 TINY = [
     Task("tracks", "lake", "cw", 30, 1, 15),
@@ -203,6 +204,27 @@ def test_a_model_that_is_trained_anew_drives_with_its_new_weights(network, tmp_p
         save_model(file, changed)
         steered.append(driving.load_driver(str(file))(frame))
     assert steered[1] - steered[0] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_a_model_that_is_trained_anew_while_it_drives_ends_the_measurement(tmp_path, monkeypatch):
+    """Else the figures of two networks would be told as those of one."""
+    model, file = tmp_path / "model.pt", tmp_path / "found.json"
+
+    def replaced(*_):
+        model.write_bytes(b"new")
+        return robustness.Figures(100, 0, 0)
+
+    monkeypatch.setattr("simulator.benchmark.command.drive", replaced)
+    monkeypatch.setattr(robustness, "measure", replaced)
+    drive = robustness.Drive("model", "", "lake", 1, TINY[1].conditions(str(model)))
+    for measure in (
+        lambda sha256: drive_all(Here(), str(model), TINY, file, {"sha256": sha256}, resume=False),
+        lambda sha256: robustness.measure_all([drive._replace(sha256=sha256)], file, Here()),
+    ):
+        model.write_bytes(b"old")
+        with pytest.raises(UserError, match=r"model\.pt: was replaced while it drove"):
+            measure(driving.digest_of(model))
+        assert not file.exists()
 
 
 def test_a_steering_that_is_no_number_is_told_in_replays_too(monkeypatch):

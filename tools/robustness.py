@@ -105,10 +105,12 @@ def measure(drive: Drive) -> Figures:
 def measure_all(drives: Sequence[Drive], file: Path, workers: Executor) -> dict[Drive, Figures]:
     """Return the figures of all drives; the file gets each as it comes, and may have some. Raises UserError."""
     kept = read_json(file) if file.exists() else {}
-    coming = {workers.submit(measure, drive): str(drive) for drive in drives if str(drive) not in kept}
+    coming = {workers.submit(measure, drive): drive for drive in drives if str(drive) not in kept}
     with progress_bar(len(coming), "drive") as bar:
         for done in as_completed(coming):
-            kept[coming[done]] = done.result()._asdict()
+            drive, figures = coming[done], done.result()
+            driving.refuse_replaced(drive.conditions.driver, drive.sha256)
+            kept[str(drive)] = figures._asdict()
             write_json(file, dict(sorted(kept.items())))
             bar.update()
     return {drive: Figures(**kept[str(drive)]) for drive in drives}

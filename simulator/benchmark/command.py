@@ -41,6 +41,7 @@ def drive_all(
             raise UserError(f"{file}: has drives of {'; '.join(others)}; leave out --resume")
     missing = [task for task in chosen if task.name not in kept]
     for task, done in zip(missing, results(pool, functools.partial(drive, driver), missing, "drive"), strict=True):
+        driving.refuse_replaced(driver, about["sha256"])
         kept[task.name] = scores.driven(task, done)
         write_json(file, {"about": about, "drives": kept})
     return [kept[task.name] for task in chosen]
@@ -64,6 +65,7 @@ def run(options: argparse.Namespace) -> None:
                 drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)
                 clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
                 drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
+            driving.refuse_replaced(entry, about["sha256"])
         except SimulatorError as error:
             on = "with --resume, the benchmark goes on after the drives that are done"
             raise SimulatorError(f"{error}; {on}") from None
