@@ -317,6 +317,9 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     monkeypatch.setattr(program, "installed", {"python model.py": "bc train"})
     recording.retry("offset")
     assert ended(recording.analyses, linked) == {"state": "failed", "message": "started: bc train"}
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", ""))  # a version that leaves another result
+    recording.retry("offset")
+    assert "the program was updated" in ended(recording.analyses, linked)["message"], "not begun again and again"
 
 
 def test_a_recording_without_an_image_has_no_lane(linked):

@@ -201,6 +201,9 @@ class Analyses:
                 message = self._analyse(*job)
             except OSError as error:
                 message = f"its process cannot be started: {message_of(error)}"
+            with contextlib.suppress(RecordingError):
+                if not message and not read_result(*job) and stamp(*job) == before:
+                    message = "the program was updated since browse began: start browse again"
             with self.changed:
                 if message and not self.ended:
                     self.failed[job, before] = program.in_commands(message)
