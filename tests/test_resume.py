@@ -262,6 +262,8 @@ def test_a_recording_and_one_below_it_are_found_again(sample_recording, tmp_path
         else:
             assert "the run began with other recordings" in refused(*command)
             trained("--output", tmp_path / "model.pt", "--resume")  # with those of the run
+    os.rename(data, tmp_path / "moved")
+    assert "data: no such folder. Put the recording back, or name its new" in refused(*command[-3:])
 
 
 def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording):

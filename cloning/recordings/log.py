@@ -89,14 +89,15 @@ class CheckedRecording(Recording):
 def find_folders(given: Iterable[str | Path], exact: bool = False) -> list[Path]:
     """Return the recordings (folders with a driving_log.csv) among and below the given folders, without duplicates.
 
-    exact: below a recording there may be others, which are not meant.
+    exact: each was a recording before; below one there may be others, which are not meant.
     Raises RecordingError if a name is of no folder, or if neither the folder nor one below it is a recording.
     """
     folders: dict[Path, Path] = {}
     for name in given:
         path = Path(name)
         if not path.exists():
-            raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
+            remedy = "Put the recording back, or name its new folder" if exact else WHERE_TO_GET_RECORDINGS
+            raise RecordingError(f"{path}: no such folder. {remedy}")
         if path.is_file():
             wanted = f"the folder of a recording, with {DRIVING_LOG} and IMG/, unpacked if it is an archive"
             raise RecordingError(f"{path}: a file; name {wanted}")
