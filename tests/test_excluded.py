@@ -12,6 +12,7 @@ from commands import TINY, python, trained
 
 from cloning.base.errors import RecordingError
 from cloning.browse.library import Library
+from cloning.recordings import excluded
 from cloning.recordings.excluded import MAX_REASON, Cut, add_cuts, delete_cuts, one_line, read_cuts
 from cloning.recordings.log import print_findings, read_recording, read_uncut
 from cloning.replay.replay import load_recording
@@ -189,3 +190,18 @@ def test_programs_that_cut_at_the_same_time_lose_nothing(linked):
 def test_a_reason_is_one_line():
     assert one_line(" off\r\nthe\troad\0 ") == "off the road"
     assert one_line("x" * 1000) == "x" * 1000 and len(one_line("x" * 20_000)) == MAX_REASON
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no lock here")
+def test_the_log_is_locked_as_nfs_asks_for_and_a_program_that_keeps_it_is_told(linked, monkeypatch):
+    import fcntl
+
+    monkeypatch.setattr(excluded, "PATIENCE", 0.1)
+    with open(linked / "driving_log.csv", "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(RecordingError, match=r"driving_log\.csv: another program is changing its cuts; try again"):
+            add_cuts(linked, Cut(center(linked, 0), center(linked, 1), ""))
+    taken = []
+    monkeypatch.setattr(fcntl, "flock", lambda file, _: taken.append(file.writable()))
+    add_cuts(linked, Cut(center(linked, 0), center(linked, 1), ""))
+    assert taken == [True]

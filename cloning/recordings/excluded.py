@@ -10,9 +10,11 @@ import io
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -27,6 +29,7 @@ if sys.platform != "win32":
 EXCLUDED, TAGS = "excluded.csv", "tags.csv"
 HEADERS = {EXCLUDED: ("first image", "last image", "reason"), TAGS: ("first image", "last image", "tag")}
 MAX_REASON = 10_000  # characters: one written by hand is as before when its deletion is undone
+PATIENCE = 10.0  # s for which another program may change a recording's cuts
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
 _one_at_a_time = threading.Lock()  # for Windows, where no other lock is taken
 
@@ -131,18 +134,40 @@ def _changing(path: Path) -> Iterator[tuple[list[str], list[Cut]]]:
     """Yield a file's lines, to be changed, and the cuts in them, while no other thread or process changes the file."""
     log = path.with_name(DRIVING_LOG)
     try:
-        locked = open(log, "rb", opener=nonblocking)  # noqa: SIM115 - closed at the end of the context below
+        locked = _locked(log)
     except OSError as error:
         raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
-    with _one_at_a_time, locked:
-        if sys.platform != "win32":
-            with contextlib.suppress(OSError):  # a network's file system without locks
-                fcntl.flock(locked, fcntl.LOCK_EX)
+    with locked, _one_at_a_time:
         lines = _lines(path)
         before = list(lines)
         yield lines, _parse(path, lines)
         if lines != before:
             write(path, "".join(lines).encode(**BYTES))
+
+
+def _locked(log: Path) -> BinaryIO:
+    """Open a recording's log, and lock it for whoever changes its cuts, where there are locks, until it is closed.
+
+    Raises RecordingError if another program keeps it locked, OSError.
+    """
+    try:
+        file: BinaryIO = open(log, "r+b", opener=nonblocking)  # noqa: SIM115 - NFS locks only what may be written
+    except OSError:
+        file = open(log, "rb", opener=nonblocking)  # noqa: SIM115
+    until = time.monotonic() + PATIENCE
+    while sys.platform != "win32":
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            break
+        except BlockingIOError:
+            if time.monotonic() > until:
+                file.close()
+                remedy = "try again, or end that one if it has stopped"
+                raise RecordingError(f"{log}: another program is changing its cuts; {remedy}") from None
+        except OSError:  # a network's file system without locks
+            break
+        time.sleep(0.01)
+    return file
 
 
 def _lines(path: Path) -> list[str]:
