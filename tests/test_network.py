@@ -50,6 +50,18 @@ def test_layer_table_is_the_reports(network):
     assert layer_table(network).endswith("559,419")
 
 
+def test_a_network_whose_layers_do_not_follow_one_another_is_shown_as_well():
+    class Gray(Network):
+        def layers(self):
+            convolutions, dense = super().layers()
+            return [nn.Conv2d(1, 24, 5, 2), *convolutions[1:]], dense
+
+        def forward(self, frames, keep=None):
+            raise NotImplementedError
+
+    assert layer_table(Gray()).endswith("558,219")
+
+
 def test_forward_is_the_reports(network, frames):
     """Against a Sequential of torch's own layers, on an image transposed by numpy (`view` would scramble it)."""
     layers = []

@@ -8,7 +8,13 @@ from cloning.network.network import Network
 
 
 def layer_table(network: Network) -> str:
-    """Return a line for each layer: its name and type, its output's shape, its parameters, and the layer before it."""
+    """Return a line for each layer: its name and type, its output's shape, its parameters, and the layer before it.
+
+    Of a network with a `forward` of its own, which alone knows that order, it has torch's description.
+    """
+    total = f"Total params: {_parameters(network):,}"
+    if type(network).forward is not Network.forward:  # its layers need not be applied one after the other
+        return f"{network}\n{total}"
     top, bottom = network.crop
     layers: list[tuple[str, str, nn.Module]] = [
         ("lambda_1", "Lambda", nn.Identity()),
@@ -27,7 +33,6 @@ def layer_table(network: Network) -> str:
             rows.append(f"{f'{name} ({keras_type})':32} {shape:22} {_parameters(layer):<11} {previous}[0][0]")
             previous = name
     title = f"{'Layer (type)':32} {'Output Shape':22} {'Param #':11} Connected to"
-    total = f"Total params: {_parameters(network):,}"
     return "\n".join(["_" * 90, title, "=" * 90, *rows, "=" * 90, total])
 
 
