@@ -261,7 +261,7 @@ class Checkpoint:
             raise ModelError(f"the network's weights and their averages take {size:,} bytes, too many for a file")
         frozen = not all(parameter.requires_grad for parameter in network.parameters())
         if frozen or next(network.buffers(), None) is not None:  # buffers: copies that compute gradients have their own
-            raise ModelError("a network with batch normalization, other buffers or frozen weights can't be trained")
+            raise ModelError("batch normalization (take GroupNorm), other buffers and frozen weights can't be trained")
         if network.crop != CROP:  # it would drive by other rows than those that it learns from
             raise ModelError(f"a network that crops frames by {network.crop}, not {CROP}, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
