@@ -18,6 +18,7 @@ from drive_process import awaited
 from scenes import cameras, load
 
 from cloning.base import progress
+from cloning.base.errors import RecordingError
 from cloning.recordings.log import read_recording
 from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH
@@ -348,3 +349,12 @@ def test_a_folder_may_have_a_name_in_any_encoding(tmp_path):
     with RecordingWriter(folder) as recording:
         recording.add(0, [b"centre", b"left", b"right"], [0, 1, 0, 30], (0, 0))
     assert len(read_recording(folder)) == 1
+
+
+def test_a_row_replaces_no_images_of_those_before(tmp_path):
+    """As those of a program's second drive did, whose time began at 0 again."""
+    with RecordingWriter(tmp_path / "drives") as recording:
+        recording.add(0, [b"centre", b"left", b"right"], [0, 1, 0, 30], (0, 0))
+        with pytest.raises(RecordingError, match="let time go on"):
+            recording.add(0, [b"other", b"left", b"right"], [0.1, 1, 0, 30], (0, 0))
+    assert next((tmp_path / "drives/IMG").glob("center*")).read_bytes() == b"centre"

@@ -102,15 +102,19 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f"{self.folder}: {error.strerror}; name a folder that can be written") from error
         self.start = start
-        self.rows = 0
+        self.rows, self.stamp = 0, ""  # the last row's
 
     def add(self, time: float, images: list[bytes], numbers: Sequence[float], lane: tuple[float, float]) -> None:
-        """Write a sample; time: simulated seconds; images: JPEGs of the centre, left and right camera.
+        """Write a sample; time: simulated seconds, growing; images: JPEGs of the centre, left and right camera.
 
         numbers: steering, -1..1, throttle and brake, 0..1, speed, mph; lane: lateral offset, m, and heading error,
-        radians, as in `LanePosition`. Raises RecordingError if the disk is full; then nothing of the sample is left.
+        radians, as in `LanePosition`. Raises RecordingError if the disk is full, or the time not later than the row's
+        before; then nothing of the sample is left.
         """
         stamp = time_stamp(self.start + timedelta(seconds=time))
+        if stamp <= self.stamp:
+            late = f"row {self.rows + 1} is of {stamp}, and that before of {self.stamp}, whose images it might replace"
+            raise RecordingError(f"{self.folder}: {late}; let time go on from one drive to the next")
         paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]
         row = ",".join([*map(str, paths), *map(csharp_number, numbers)]) + "\n"
         header = "" if self.rows else ",".join(LANE_COLUMNS) + "\n"
@@ -132,7 +136,7 @@ class RecordingWriter:
                     path.unlink(missing_ok=True)
             complete = f"the {self.rows} rows before it are complete"
             raise RecordingError(f"{self.folder}: {error.strerror}; {complete}") from error
-        self.rows += 1
+        self.rows, self.stamp = self.rows + 1, stamp
 
     def begin_drive(self) -> None:
         """Let the next samples be a drive of their own: they are dated later, by more than a drive's longest pause."""
