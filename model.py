@@ -8,9 +8,8 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
-bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's model, as in the report), model-best.pt
-(the epoch that drives best), and other files, which README.md lists. From a program: `train(replace(REPORT, flip=0.0),
-["data"], "runs/a/model.pt")`.
+bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's, as in the report), model-best.pt (the
+one's that drives best), and others: see README.md. In a program: `train(replace(REPORT, flip=0.0), "data", "m.pt")`.
 """
 
 from cloning.base import program
@@ -435,9 +434,10 @@ def execute(command: Command) -> int:
 def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, seed: int = 0, **process: Any) -> int:
     """Train a network by any recipe, as the command does; return the exit status, or under torchrun end with it.
 
-    recordings, output, process: as for the options; a run is resumed only if its recipe and its recordings are these.
+    process: as for the options, or `from_model`: --from; a run is resumed only if its recipe and recordings are these.
     """
-    run = Run(recipe, tuple(map(str, [recordings] if isinstance(recordings, str | Path) else recordings)), int(seed))
+    folders = tuple(map(str, [recordings] if isinstance(recordings, str | Path) else recordings))
+    run = Run(recipe, folders, int(seed), str(process.pop("from_model", "")))
     return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from commands import SHORT, begun_training, edited, refused, same, trained, weig
 
 from cloning.network import tensors
 from cloning.training.options import parse
-from model import REPORT, ROBUST
+from model import REPORT, ROBUST, train
 
 FEW = (*SHORT, "--samples-per-epoch", 40)
 
@@ -18,6 +19,13 @@ FEW = (*SHORT, "--samples-per-epoch", 40)
 def base(finished, tmp_path):
     """The model of a finished run, under another name."""
     return shutil.copy(finished[1] / "model.pt", tmp_path / "base.pt")
+
+
+def test_a_program_trains_a_network_on(sample_recording, base, tmp_path):
+    still = replace(REPORT, learning_rate=1e-9, epochs=1, samples_per_epoch=16, batch_size=8)
+    assert train(still, sample_recording, tmp_path / "on.pt", device="cpu", from_model=base) == 0
+    for name, values in weights(tmp_path / "on.pt").items():
+        torch.testing.assert_close(values, weights(base)[name])
 
 
 def set_preprocessing(path, **preprocessing):
