@@ -12,6 +12,7 @@ import torch
 from commands import same, weights
 from steer_server import unused_port
 
+from cloning.training.recipe import Augmentation
 from model import REPORT, ROBUST, train
 
 BRIEF: dict[str, Any] = {"epochs": 1, "samples_per_epoch": 16, "batch_size": 8}
@@ -73,7 +74,11 @@ def test_figures_of_another_type_are_refused(figure: dict[str, Any]):
         replace(REPORT, **figure)
 
 
-@pytest.mark.parametrize("figure", [{"flip": 90.0}, {"epochs": 0}, {"learning_rate": math.nan}])
+BEYOND = [{"flip": 90.0}, {"epochs": 0}, {"learning_rate": math.nan}]
+BEYOND += [{"augmentations": (Augmentation("mine", share=50),)}]
+
+
+@pytest.mark.parametrize("figure", BEYOND)
 def test_figures_beyond_their_limits_are_refused(figure: dict[str, Any]):
     with pytest.raises(ValueError, match=f"{next(iter(figure))} is .*, not a number from .* to .*"):
         replace(REPORT, **figure)

@@ -140,6 +140,9 @@ class Recipe:
             if item.type in (int, float) and not least <= value <= most:
                 raise ValueError(f"{item.name} is {value!r}, not a number from {least:g} to {most:g}")
             object.__setattr__(self, item.name, value)
+        for share in self.shares():
+            if not 0 <= share <= 1:
+                raise ValueError(f"a share of the augmentations is {share!r}, not a number from 0 to 1")
         if self.best_by not in ("val_loss", "val_drift"):
             raise ValueError(f"best_by is {self.best_by!r}, not 'val_loss' or 'val_drift'")
 
