@@ -8,8 +8,8 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
-bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's, as in the report), model-best.pt (the
-one's that drives best), and others: see README.md. In a program: `train(replace(REPORT, flip=0.0), "data", "m.pt")`.
+bottom, and REPORT has all its figures. A run writes model.pt (of the last epoch, as in the report), model-best.pt (of
+the one that drives best), and more: see README.md. In a program: `train(replace(REPORT, flip=0.0), "data", "m.pt")`.
 """
 
 from cloning.base import program
