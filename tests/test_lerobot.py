@@ -185,6 +185,21 @@ def test_another_cars_data_set_becomes_a_recording_and_what_does_not_fit_is_told
     assert recording.throttle.max() == 1 and recording.speed.max() == 0
 
 
+def test_the_first_row_of_an_episode_is_found_in_hevc_too(data_set, tmp_path):
+    """Each frame is white in other columns."""
+    with av.open(data_set / f"videos/{CENTER}/chunk-000/file-000.mp4", "w") as film:
+        stream = film.add_stream("libx265", 15, options={"g": "3", "x265-params": "log-level=none"})
+        stream.pix_fmt, stream.height, stream.width = "yuv420p", 160, 320
+        for row in range(19):
+            frame = np.zeros((160, 320, 3), np.uint8)
+            frame[:, 16 * row :][:, :16] = 255
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+        film.mux(stream.encode(None))
+    converted(data_set, "--camera", CENTER, "--output", tmp_path / "recording")
+    recording = checked(tmp_path / "recording")
+    assert [read_frame(recording.path(row))[80, 8::16, 0].argmax() for row in range(19)] == list(range(19))
+
+
 def test_a_data_set_of_version_2_with_images_in_its_tables(data_set, tmp_path):
     frames = [render_frame(0.3, 0, np.random.default_rng(row)) for row in range(8)]
     table = pq.read_table(data_set / "data/chunk-000/file-000.parquet").slice(0, 8)

@@ -21,6 +21,7 @@ INFO = "meta/info.json"
 # What reading a file raises that is another than LeRobot's, or damaged
 WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, pa.ArrowException)
 CLONE = "or run `git lfs pull` where git has cloned it"
+REORDERED = 16  # frames at most that a film stores after a key frame, but shows before it
 MOST_NUMBERS = 1000  # of a feature without names; a damaged file may tell of any number
 
 
@@ -121,7 +122,8 @@ def _images(
     start, rate, row = where.get("from_timestamp", 0.0), info["fps"], 0
     with av.open(str(path.absolute())) as film:  # else http:… in the current folder would be an address, not a file
         stream = film.streams.video[0]
-        film.seek(int(start / stream.time_base), stream=stream)  # to the key frame before it
+        before = max(0.0, start - REORDERED / rate)  # else HEVC's films begin at the key frame after it
+        film.seek(int(before / stream.time_base), stream=stream)
         for frame in film.decode(stream):
             if frame.time > start + (row + 0.5) / rate:
                 break  # or all frames that follow were other rows'
