@@ -3,6 +3,7 @@ import {clock, element} from "./common.js";
 import {marked, page, remember, say} from "./state.js";
 
 const PAUSE = 0.07; // s that the last frame is shown before they are played again
+const LONGEST = 0.5; // s between two pictures: after more the page was hidden, and what nobody saw is not left out
 
 // The reasons to jump to a row: what such rows are, why there are none, and whether they are in order of their size.
 export const JUMPS = {
@@ -54,7 +55,7 @@ export function play() {
   const tick = () => {
     if (page.open != now || !now.playing) return;
     const [first, last] = now.loop ? looped() : [0, now.count - 1], time = performance.now();
-    at += (time - before) / 1000 * now.speed;
+    at += Math.min((time - before) / 1000, LONGEST) * now.speed;
     before = time;
     let row = now.row;
     while (row < last && seconds[row + 1] <= at) row++;
