@@ -150,6 +150,21 @@ def test_a_recording_comes_back_with_the_same_rows(recordings, written, tmp_path
             at += 1
 
 
+def test_no_film_is_so_long_that_lerobot_mistakes_the_times_of_its_frames(recordings, tmp_path, monkeypatch):
+    """It asks for them in float32, as they are in the table, and allows for 0.0001 s."""
+    rows, starts = np.arange(4500), 4500 * np.arange(10)
+    for begin in starts - dataset._film_begins(starts, np.full(10, 4500), 15):
+        asked = np.float32(begin / 15 + np.float32(rows / 15).astype(float))
+        assert np.abs(asked - np.float32((begin + rows) / 15)).max() < 1e-4
+    monkeypatch.setattr(dataset, "FILM_SECONDS", 0.9)
+    converted(*recordings, "--output", tmp_path / "set")
+    assert len(list((tmp_path / "set/videos" / CENTER).rglob("*.mp4"))) == 2
+    converted(tmp_path / "set", "--output", tmp_path / "back")
+    back, before = checked(tmp_path / "back"), [checked(folder).without_copies() for folder in recordings]
+    frames = [read_frame(each.path(row)) for each in before for row in range(len(each))]
+    assert max(cv2.absdiff(read_frame(back.path(at)), frame).mean() for at, frame in enumerate(frames)) < 4
+
+
 def test_another_cars_data_set_becomes_a_recording_and_what_does_not_fit_is_told(data_set, tmp_path):
     """One camera; steering of another name, unit and sign; no speed in mph; episodes that each begin at 0."""
     known = features(data_set)

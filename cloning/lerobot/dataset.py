@@ -2,7 +2,7 @@
 
 | feature | what it holds |
 |---|---|
-| `observation.images.center`, `.left`, `.right` | the cameras' frames, 160 x 320, RGB: a film each, H.264 |
+| `observation.images.center`, `.left`, `.right` | the cameras' frames, 160 x 320, RGB: films of each, H.264 |
 | `observation.state` | speed in mph, and in m/s, because LeRobot's policies fail with a state of one number |
 | `action` | steering, -1..1 for -25..25 degrees, right positive; throttle and brake, 0..1 |
 | `recorded_at` | seconds since 1970 by the recording computer's clock; `timestamp` counts frames of equal length |
@@ -13,6 +13,7 @@ The format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3; read back wi
 import io
 import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ COUNTS = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 SAMPLED = 8  # every so many rows and columns of a frame count for the statistics
 COUNTED = 5000  # frames at most, evenly chosen, as LeRobot does: more take 60 kB each
+# LeRobot compares times in float32, to 0.0001 s: later in a film, it would find frames of some episodes at other times.
+FILM_SECONDS = 1024
 KEY_FRAMES = 15  # so that a frame anywhere in a film is soon decoded
 FIRST_FILE = "chunk-000/file-000"
 PATHS = {
@@ -78,7 +81,7 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
     lengths = np.concatenate([np.diff([0, *at, len(each)]) for each, at in zip(recordings, breaks, strict=True)])
     starts = np.cumsum(lengths) - lengths
     index, rows = np.arange(len(times)), [(each, row) for each in recordings for row in range(len(each))]
-    episode = np.repeat(np.arange(len(lengths)), lengths)
+    episode, begins = np.repeat(np.arange(len(lengths)), lengths), _film_begins(starts, lengths, rate)
     columns = {
         STATE: np.stack([speed, speed * np.float32(MPH)], axis=1),
         ACTION: np.concatenate([np.stack([getattr(each, name) for name in UNITS[ACTION]], 1) for each in recordings]),
@@ -90,18 +93,22 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
         values: dict[str, np.ndarray] = dict(columns)
         with progress_bar(len(FILMS) * len(times), "image", desc="writing films", leave=False) as bar:
             for key, camera in FILMS.items():
-                path = temporary / PATHS["video_path"].format(video_key=key, chunk_index=0, file_index=0)
-                path.parent.mkdir(parents=True)
                 sampled = []
-                with FilmWriter(path, rate, key_frames=KEY_FRAMES) as film:
-                    for (recording, row), is_first in zip(rows, columns["frame_index"] == 0, strict=True):
-                        frame = read_frame(recording.path(row, CAMERAS.index(camera)))
-                        film.add(frame, is_key=is_first)
-                        sampled.append(frame[::SAMPLED, ::SAMPLED].copy())
-                        bar.update()
+                for number, (begin, end) in enumerate(pairwise([*dict.fromkeys(begins), len(times)])):
+                    path = temporary / PATHS["video_path"].format(video_key=key, chunk_index=0, file_index=number)
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    with FilmWriter(path, rate, key_frames=KEY_FRAMES) as film:
+                        for at in range(begin, end):
+                            recording, row = rows[at]
+                            frame = read_frame(recording.path(row, CAMERAS.index(camera)))
+                            film.add(frame, is_key=columns["frame_index"][at] == 0)
+                            sampled.append(frame[::SAMPLED, ::SAMPLED].copy())
+                            bar.update()
                 values[key] = np.stack(sampled)
         _write_table(temporary / f"data/{FIRST_FILE}.parquet", _data(columns))
-        _write_table(temporary / f"meta/episodes/{FIRST_FILE}.parquet", _episodes(values, starts, lengths, rate))
+        _write_table(
+            temporary / f"meta/episodes/{FIRST_FILE}.parquet", _episodes(values, starts, lengths, begins, rate)
+        )
         _write_table(temporary / "meta/tasks.parquet", _tasks())
         statistics = {key: _statistics(value) for key, value in values.items()}
         write(temporary / "meta/stats.json", json.dumps(statistics, indent=1).encode())
@@ -118,6 +125,15 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
         write(temporary / "README.md", (CARD + (__doc__ or "").partition("\n\n")[2]).encode())
         write(temporary / "env.py", ENVIRONMENT.encode())
     return f"{plural(len(times), 'frame')} of 3 cameras in {plural(len(lengths), 'episode')}, {rate} a second"
+
+
+def _film_begins(starts: np.ndarray, lengths: np.ndarray, rate: int) -> list[int]:
+    """Return the row with which the film begins that has each episode; an episode that is too long has its own."""
+    begins = list[int]()
+    for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+        goes_on = begins and start + length - begins[-1] <= FILM_SECONDS * rate
+        begins.append(begins[-1] if goes_on else start)
+    return begins
 
 
 def _features(rate: int) -> dict[str, dict[str, Any]]:
@@ -146,9 +162,14 @@ def _data(columns: dict[str, np.ndarray]) -> pa.Table:
     return pa.table(arrays)
 
 
-def _episodes(values: dict[str, np.ndarray], starts: np.ndarray, lengths: np.ndarray, rate: int) -> pa.Table:
-    """Return the table of the episodes; values: of each feature in all rows; starts: first row of each episode."""
-    zeros, ends = 0 * starts, starts + lengths
+def _episodes(
+    values: dict[str, np.ndarray], starts: np.ndarray, lengths: np.ndarray, begins: list[int], rate: int
+) -> pa.Table:
+    """Return the table of the episodes.
+
+    values: of each feature in all rows; starts: first row of each episode; begins: of `_film_begins`.
+    """
+    zeros, ends, film = 0 * starts, starts + lengths, np.unique(begins, return_inverse=True)[1]
     columns: dict[str, Any] = {
         "episode_index": np.arange(len(starts)),
         "tasks": [[TASK]] * len(starts),
@@ -157,8 +178,10 @@ def _episodes(values: dict[str, np.ndarray], starts: np.ndarray, lengths: np.nda
         **{f"{name}/{kind}_index": zeros for name in ("data", "meta/episodes") for kind in ("chunk", "file")},
     }
     for key in FILMS:
-        columns |= {f"videos/{key}/{kind}_index": zeros for kind in ("chunk", "file")}
-        columns |= {f"videos/{key}/from_timestamp": starts / rate, f"videos/{key}/to_timestamp": ends / rate}
+        columns |= {f"videos/{key}/chunk_index": zeros, f"videos/{key}/file_index": film}
+        columns |= {
+            f"videos/{key}/{end}_timestamp": (each - begins) / rate for end, each in (("from", starts), ("to", ends))
+        }
     for key, value in values.items():
         episodes = [_statistics(value[start:end]) for start, end in zip(starts, ends, strict=True)]
         columns |= {f"stats/{key}/{name}": [each[name] for each in episodes] for name in episodes[0]}
