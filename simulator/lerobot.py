@@ -51,6 +51,7 @@ class LeRobotDrive(gymnasium.Wrapper):
 def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> dict[str, dict[int, VectorEnv]]:
     """Return vector environments of the lake track, or of the one that LeRobot's configuration `cfg` names as its task.
 
+    Each episode begins elsewhere on the lane's centre, by its seed: from one place a policy succeeds always or never.
     n_envs: that many drive at once; use_async_envs: each in a process of its own. LeRobot calls this function from the
     env.py beside a data set, once that is in a model repository on the Hub; in a data set's LeRobot does not look:
     `lerobot.envs.factory.make_env("USER/REPOSITORY", n_envs=2, trust_remote_code=True)`. Raises TrackError.
@@ -58,7 +59,7 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> 
     track = getattr(cfg, "task", None) or "lake"
 
     def make() -> gymnasium.Env:
-        return LeRobotDrive(gymnasium.make(ID, track=track, render_mode="rgb_array"))
+        return LeRobotDrive(gymnasium.make(ID, track=track, random_start=True, render_mode="rgb_array"))
 
     vector = AsyncVectorEnv if use_async_envs else SyncVectorEnv
     return {track: {0: vector([make] * n_envs, autoreset_mode=AutoresetMode.SAME_STEP)}}

@@ -446,6 +446,8 @@ def test_the_environment_for_lerobot(written):
         if terminated[0]:
             break
     assert info["final_info"]["is_success"].tolist() == [False]
+    starts = [drive.reset(seed=[seed])[1]["s"][0] for seed in (1, 2, 1)]
+    assert starts[0] == starts[2] != starts[1]
     assert drive.call("task_description") == ("Follow the road.",) and drive.call("_max_episode_steps") == (9000,)
     drive.close()
 
