@@ -231,6 +231,15 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
         read_result(linked, LANE)
 
 
+def test_a_result_is_of_the_images_as_they_were(copied):
+    """All may be changed in place, as by a program that exchanges their colours."""
+    write_result(copied, LANE, stamp(copied, LANE), Result(np.zeros(1, np.int32), {"offset": np.zeros(1)}, {}))
+    assert read_result(copied, LANE)
+    for image in (copied / "IMG").iterdir():
+        os.utime(image, ns=(0, 0))
+    assert read_result(copied, LANE) is None
+
+
 @pytest.fixture
 def recording(linked):
     with opened(linked) as recording:

@@ -64,13 +64,18 @@ class Result:
 def stamp(folder: Path, analysis: Analysis) -> str:
     """Return what tells whether a result is still of the same files: their sizes and times of change, and the cuts.
 
-    A `lane.csv` counts if there is one. Only a replay leaves out what is cut. Raises RecordingError if the log, the
-    images or the model is gone, and if a replay cannot read the cuts.
+    A `lane.csv` counts if there is one, and one image, which shows that all were changed in place. Only a replay leaves
+    out what is cut. Raises RecordingError if the log, the images or the model is gone, and if a replay cannot read the
+    cuts.
     """
     paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *[Path(analysis.model)] * bool(analysis.model)]
     paths += [folder / LANE_FILE] * (folder / LANE_FILE).exists()
     cuts = f" {[(cut.first, cut.last) for cut in read_cuts(folder)]}" if analysis.kind == "replay" else ""
-    return f"{RULES} {[file_stamp(path) for path in paths]}{cuts}"
+    stamps = [file_stamp(path) for path in paths]
+    with contextlib.suppress(OSError, StopIteration), os.scandir(folder / IMAGE_FOLDER) as images:
+        status = next(images).stat()  # of all of them it would take too long: this is asked every few seconds
+        stamps.append((status.st_size, status.st_mtime_ns))
+    return f"{RULES} {stamps}{cuts}"
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
