@@ -128,6 +128,7 @@ def folders_below(path: Path) -> Iterator[Path]:
             below.clear()  # reached a second time, through a link
             continue
         visited.add(real)
+        below.sort()  # of several links to a recording the first name counts, in whatever order the disk lists them
         if DRIVING_LOG in files:
             below[:] = [name for name in below if name != IMAGE_FOLDER]  # which takes long to list
             yield Path(folder)
