@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from cloning.base.errors import OutputError
 from cloning.base.film import DriveFilm
 from cloning.recordings.format import SAMPLE_RATE
+from cloning.road import track as track_module
 from cloning.road.track import LEFT, Track
 from simulator import record
 from simulator.expert import Recovery
@@ -20,7 +21,7 @@ from simulator.run import Run
 from simulator.scenery import jungle, textures
 from simulator.scenery.looks import DARKEST, SHADOWED, expose, make_look, tone_matrix
 from simulator.scenery.shade import HALF_WIDTH, LENGTH, OVERLAP, PICTURE_SHAPE, STRETCH, Shade, ShadeStyle
-from simulator.scenery.shapes import Light, box, plants
+from simulator.scenery.shapes import Light, Material, box, distances, plants, surface
 
 
 @pytest.mark.parametrize("track", ["lake", "jungle", "road-9"])
@@ -30,6 +31,15 @@ def test_another_look_is_another_image_of_the_same_road(track):
     one, other = ([mesh.points for mesh in meshes if mesh.road is not None] for meshes in both)
     assert sum(map(len, one)) > 5000
     assert all(np.array_equal(*points) for points in zip(one, other, strict=True))
+
+
+def test_the_jungles_surface_is_the_same_where_a_processor_rounds_otherwise(monkeypatch):
+    tracks, line = [Track("jungle")], track_module.centre_line("jungle")
+    monkeypatch.setattr(track_module, "centre_line", lambda source: line * (1 + 1e-14))
+    tracks.append(Track("jungle"))
+    asphalt = Material((1, 1, 1), textures.plain(), 8)
+    here, there = (surface(track, distances(0, track.length, 1.5), 4.5, asphalt).points for track in tracks)
+    assert np.abs(here - there).max() < 1e-9
 
 
 def test_no_look_has_lines_darker_than_their_road():

@@ -50,6 +50,8 @@ class Road:
     centre_line: bool = False  # whether a line is painted along the centre
     training: tuple[float, float] | None = None  # x, y where this mode starts, m; None: at the first point listed
     autonomous: tuple[float, float] | None = None  # likewise
+    # m, of a lap; None: as it is computed. Its last bit, another on ARM, decides which points the jungle's surface has.
+    length: float | None = None
 
 
 # The real simulator's two. Kerbs and bridges were measured in its recordings, aligned to the centre lines.
@@ -74,7 +76,7 @@ ROADS = {
         training=(179.8, 89.9),
         autonomous=(-40.6, 108.7),
     ),
-    "jungle": Road(forward="cw", edge=4.5, bridge=(806, 872), centre_line=True),
+    "jungle": Road(forward="cw", edge=4.5, bridge=(806, 872), centre_line=True, length=1493.5740055860442),
 }
 
 
@@ -133,7 +135,7 @@ class Track:
         self.direction, self.closed = direction or road.forward, of_points is None or of_points.closed
         if listed.shape[1] == 2:
             listed = np.c_[listed, np.zeros(len(listed))]
-        self._place_points(listed, of_points.lead if of_points else 0.0)
+        self._place_points(listed, of_points.lead if of_points else 0.0, road.length)
         n = len(self.points)
         self.edges = np.full((n, 2), road.edge)
         for kerb in road.kerbs:
@@ -159,10 +161,10 @@ class Track:
             for mode, start in (("training", road.training), ("autonomous", road.autonomous))
         }
 
-    def _place_points(self, listed: np.ndarray, lead: float) -> None:
+    def _place_points(self, listed: np.ndarray, lead: float, length: float | None) -> None:
         """Place points about 1 m apart on a smooth curve through those listed, float64 (n, 3).
 
-        lead: m of straight road before and after an open road.
+        lead: m of straight road before and after an open road; length: see `Road`.
         """
         from scipy.interpolate import CubicSpline  # large, and not needed to train as the report does
 
@@ -171,7 +173,7 @@ class Track:
         curve = CubicSpline(chord, ring, bc_type="periodic" if self.closed else "natural")
         fine = np.vstack([curve(np.arange(0, chord[-1], 0.05)), ring[-1:]])
         along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1))]
-        self.length = float(along[-1])
+        self.length = length or float(along[-1])
         n = round(self.length)
         self.step = self.length / n
         s = np.arange(n if self.closed else n + 1) * self.step
