@@ -147,7 +147,6 @@ class SessionFolder:
             if self._zero is None or simulated < self._simulated:  # its first frame, or it has begun anew
                 self._zero = max(now, self._last) - timedelta(seconds=simulated)
             self._simulated, now = simulated, self._zero + timedelta(seconds=simulated)
-        now -= timedelta(microseconds=now.microsecond % 1000)
         self._last = max(now, self._last + timedelta(milliseconds=1))
         self._queue.put(partial(self._write, self.path / f"{time_stamp(self._last)}.jpg", jpeg, driven))
 
