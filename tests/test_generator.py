@@ -12,8 +12,10 @@ import torch
 from rendered import without_files as recording
 
 import model
+from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.network.network import Network
 from cloning.recordings.check import check_images
+from cloning.recordings.frames import FrameCache
 from cloning.recordings.log import read_recording
 from cloning.training.gpu import GpuFrames
 from cloning.training.lanes import Lanes
@@ -148,6 +150,16 @@ def test_a_pass_takes_every_observation_once_and_the_next_one_in_another_order(g
     first, second = seen[:size], seen[size : 2 * size]
     assert sorted(first) == sorted(second) == list(range(size))
     assert list(first) != list(second)
+
+
+def test_frames_that_are_kept_are_those_that_were_decoded_and_are_decoded_once():
+    cache, folder = FrameCache(2), Path("a")
+    decoded = np.random.default_rng(0).integers(0, 255, (3, *FRAME), np.uint8)
+    for image, frame in enumerate(decoded):
+        cache.put((folder, image), frame)
+    for image, frame in enumerate(decoded):
+        again = (lambda: pytest.fail("it is kept")) if image < 2 else (lambda: decoded[2])
+        assert np.array_equal(cache.get((folder, image), again), frame[ROAD_ROWS])
 
 
 def test_images_and_angles_of_an_observation(generator):

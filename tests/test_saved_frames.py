@@ -6,7 +6,7 @@ import shutil
 import sys
 import threading
 import time
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -33,6 +33,7 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     folder.mkdir()
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
     (folder / frames.DRIVEN).write_bytes(b"old")
+    (folder / ".2018_07_16_17_11_43_420.jpg.0123abcd.part").write_bytes(b"of a drive that was killed")
     (folder / ".DS_Store").write_bytes(b"macOS's")  # of somebody who has looked into it
     frames.empty_folder(folder)
     assert list(folder.iterdir()) == []
@@ -131,3 +132,4 @@ def test_frames_are_named_by_the_simulators_own_time_where_it_tells_it(tmp_path)
     times = [frames.taken_at(path.name) for path in sorted((tmp_path / "run1").glob("*.jpg"))]
     seconds = [(time - times[0]).total_seconds() for time in times if time and times[0]]
     assert seconds == pytest.approx([0, 0.5, 1, 1, 1.25], abs=0.0021)
+    assert times[0] and abs(times[0] - datetime.now(UTC).replace(tzinfo=None)) < timedelta(minutes=1)

@@ -159,6 +159,8 @@ def test_a_departure_is_noted_and_the_car_set_back():
         assert run.time < 4
     (departure,) = run.departures
     assert (departure.side, departure.time) == ("left", run.time)
+    driven = run.trajectory
+    assert (departure.x, departure.y, departure.speed) == (driven.x[-1], driven.y[-1], driven.speed[-1])
     assert abs(run.offset) < 0.001 and run.speed_mph < 0.001
     assert lap_report(run)["autonomy"] == pytest.approx(1 - 6 / run.time, abs=1e-4)
 
