@@ -73,6 +73,7 @@ def test_the_car_follows_its_wheels_with_a_lag(sample_recording):
     seconds = recording.time[21:] - recording.time[20]
     assert not turning[:20].any()
     assert turning[20:] == pytest.approx(motion.curvature(0.5) * (1 - np.exp(-seconds / motion.YAW_LAG)), rel=1e-6)
+    assert path.slip == pytest.approx(-motion.SLIP * turning * (20 * motion.MPH) ** 2), "to the outside of the bend"
 
 
 def test_breaks_are_not_driven_over(sample_recording):
@@ -87,6 +88,8 @@ def test_breaks_are_not_driven_over(sample_recording):
     assert rows() == [slice(0, 100), slice(100, 150), slice(160, 240)]
     recording.speed[200] = 9  # set back
     assert rows()[-1] == slice(201, 240)
+    recording.speed[:] = 2  # mph, less than 1 m/s
+    assert rows() == []
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)

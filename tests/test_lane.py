@@ -200,7 +200,7 @@ def test_cameras_and_rows_are_fused(lake_drive):
 
 
 @pytest.mark.parametrize("known", [0, 60])
-@pytest.mark.parametrize(("difference", "which"), [(0.5, 1), (0.05, 0)])
+@pytest.mark.parametrize(("difference", "which"), [(0.5, 1), (-0.5, 1), (0.05, 0)])
 def test_an_unknown_road_is_read_by_the_network_for_any_road(lake_drive, difference, which, known, monkeypatch):
     """Though the one for the tracks is trusted in more rows; where both agree, that one counts.
 

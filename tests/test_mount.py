@@ -122,7 +122,7 @@ def test_what_is_certain_is_moved_back_and_nothing_else():
     for told, deviation in ((small, 0.1), (unsure, 11.0), ((0, 0, 0), 0.1)):
         unmoved = Mount(Tells(tuple(told), deviation))
         assert all(unmoved(frame) is frame for frame in frames) and not str(unmoved)
-    one = Mount(Tells((-20.0, 8.0, 14.0), 1.0))
+    one = Mount(Tells((-20.0, 8.0, 14.0), 6.0))
     back = [one(frame) for frame in frames][-1]
     assert one.found.tolist() == pytest.approx([-20, 0, 14]), "8 pixels are too few"
     assert str(one) == "20 pixels to the left, 14° anticlockwise"

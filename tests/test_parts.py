@@ -9,7 +9,7 @@ from rendered import without_files
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.cuts import find_cuts
 from cloning.lane.follow import Candidate, TrackFilter, short_of_bend
-from cloning.lane.localise import cameras_exchanged, localise_all, steers_against_bends
+from cloning.lane.localise import _pieces, cameras_exchanged, localise_all, steers_against_bends
 from cloning.lane.parts import EXPECTED, Placing, certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
@@ -282,8 +282,10 @@ def test_frames_of_nothing_cost_their_own_rows_which_belong_to_no_piece(lake):
     assert np.isnan(offset[310:350]).all()
     position = fuse_detections(recording, centres)
     assert isinstance(position, LanePosition) and not position.placed.any() and not position.piece.any()
-    for number, (rows, _) in enumerate(parts, 1):
-        position.piece[rows] = number
-    position.piece[position.piece == 0] = MISHAP
-    [stretch] = stretches(recording)
-    assert [each.rows for each in position.pieces(recording, stretch)] == [rows for rows, _ in parts]
+    [stretch], found = stretches(recording), [rows for rows, _ in parts]
+    assert not _pieces(640, [stretch], found[:1])[found[0].stop :].any(), "so many rows are another road"
+    position.piece[:] = _pieces(640, [stretch], found)
+    assert (position.piece[np.isnan(offset)] == MISHAP).all()
+    position.piece[-20:] = 9  # too short for a piece
+    found[-1] = slice(found[-1].start, 620)
+    assert [each.rows for each in position.pieces(recording, stretch)] == found

@@ -91,6 +91,8 @@ def test_frames_in_time_change_nothing():
     for number in range(300):
         steering = np.float32(world.steering())
         assert corrected(predictor, steering, world.frame(), number * PAUSE, SPEED) == steering
+        explained = predictor.road - FOR_OFFSET * predictor.seen[0] - FOR_HEADING * predictor.seen[1]
+        assert explained == pytest.approx(curvature(float(steering)))
         world.move(float(steering))
     assert predictor.delay.frames == 0
 

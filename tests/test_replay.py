@@ -147,6 +147,8 @@ def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):
         assert not done.interventions and done.offset[0] == pytest.approx(begin)
         after_2_s = np.abs(done.offset[30:])
         assert after_2_s.max() < 0.3 and after_2_s.mean() < 0.15, "it cuts the slalom's bends a little"
+    slow = recording.take(slice(40), speed=np.full(40, 3, np.float32))  # so near, no lane ahead is known
+    assert np.abs(replay.drive(slow, human(slow), 1.0, ORACLE_DRIVER).steering).max() < 1
 
 
 def test_the_oracle_drives_the_real_jungle():
@@ -234,6 +236,7 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(copied, tmp_path, m
     printed = capsys.readouterr().out
     assert "lane's centre unknown in 60 rows from center_" in printed
     assert "2 m, from the recorded driver's path: autonomy" in printed and "0.0 % of the rows" in printed
+    assert "from both" not in printed
     limits = list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"])
     assert limits == ["2", "1"], "one given twice counts once"
     assert [frame.shape[1] for frame in film_of(tmp_path / "x.mp4")[1]] == [1280] * 60, "one drive writes the film"
