@@ -80,6 +80,10 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
     road = summary.road_of(result, recording.images[:, 0], np.zeros(60, bool))
     assert road["roads"] == [["lake", "cw"]] and len(road["path"]) == 1 and len(road["path"][0]) == 40
     assert road["path"][0][0] == pytest.approx([x[10], y[10]], abs=0.06)
+    before = slice(8), Localisation(Track("jungle", "cw"), placed.states[:8], 0.0, 0.0)
+    monkeypatch.setattr("cloning.lane.localise.localise_all", lambda *_: [before, (slice(10, 50), placed)])
+    both = summary.road_of(analyse.lane(recording), recording.images[:, 0], np.zeros(60, bool))
+    assert both["roads"] == [["lake", "cw"], ["jungle", "cw"]] and both["path"] == road["path"], "the longer one first"
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -32,6 +32,9 @@ from simulator.run import Run
 from tools import robustness
 
 IMAGE_KINDS = [kind for kind in KINDS if kind not in ("dropped", "late")]
+# Mean grey levels by which each of them changes a frame
+CHANGES = [10.64, 67.65, 42.05, 96.98, 60.16, 10.6, 3.53, 2.88, 3.7, 43.12]
+CHANGES += [20.6, 98.07, 91.93, 34.69, 4.36, 2.63, 10.88, 8.89, 10.35, 6.77]
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +62,11 @@ def test_a_stronger_disturbance_leaves_less_of_the_frame(kind, frames):
     mild, middling, strong = map(likeness, (1, 3, 5))
     assert mild > middling > strong
     assert np.array_equal(before, frames[0]), "the frame itself is not changed"
+
+
+def test_strength_3_changes_a_frame_by_as_much_as_when_the_leaderboard_was_measured(frames):
+    changes = [cv2.absdiff(disturb(frames[0], Disturbance(kind, 3), 0), frames[0]).mean() for kind in IMAGE_KINDS]
+    assert changes == pytest.approx(CHANGES, rel=0.005)
 
 
 def test_strength_3_is_that_of_the_benchmarks(frames):
