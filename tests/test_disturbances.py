@@ -64,7 +64,7 @@ def test_a_stronger_disturbance_leaves_less_of_the_frame(kind, frames):
     assert np.array_equal(before, frames[0]), "the frame itself is not changed"
 
 
-def test_strength_3_changes_a_frame_by_as_much_as_when_the_leaderboard_was_measured(frames):
+def test_strength_3_changes_a_frame_by_as_much_as_in_version_3_of_the_rules(frames):
     changes = [cv2.absdiff(disturb(frames[0], Disturbance(kind, 3), 0), frames[0]).mean() for kind in IMAGE_KINDS]
     assert changes == pytest.approx(CHANGES, rel=0.005)
 
