@@ -437,8 +437,8 @@ def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, 
     process: as for the options, or `from_model`: --from; a run is resumed only if its recipe and recordings are these.
     """
     folders = tuple(map(str, [recordings] if isinstance(recordings, str | Path) else recordings))
-    run = Run(recipe, folders, int(seed), str(process.pop("from_model", "")))
-    return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))
+    run, own = Run(recipe, folders, int(seed), str(process.pop("from_model", None) or "")), {recipe.name: recipe}
+    return execute(Command(run, Process(str(output), **process), options.given_by_program(run), own))
 
 
 def main(argv: list[str] | None = None) -> int:

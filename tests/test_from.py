@@ -24,6 +24,7 @@ def base(finished, tmp_path):
 def test_a_program_trains_a_network_on(sample_recording, base, tmp_path):
     still = replace(REPORT, learning_rate=1e-9, epochs=1, samples_per_epoch=16, batch_size=8)
     assert train(still, sample_recording, tmp_path / "on.pt", device="cpu", from_model=base) == 0
+    assert train(still, sample_recording, tmp_path / "on.pt", device="cpu", from_model=None, resume=True) == 0
     for name, values in weights(tmp_path / "on.pt").items():
         torch.testing.assert_close(values, weights(base)[name])
 

@@ -73,8 +73,8 @@ def stamp(folder: Path, analysis: Analysis) -> str:
     cuts = f" {[(cut.first, cut.last) for cut in read_cuts(folder)]}" if analysis.kind == "replay" else ""
     stamps = [file_stamp(path) for path in paths]
     with contextlib.suppress(OSError, StopIteration), os.scandir(folder / IMAGE_FOLDER) as images:
-        status = next(images).stat()  # of all of them it would take too long: this is asked every few seconds
-        stamps.append((status.st_size, status.st_mtime_ns))
+        image = next(each for each in images if not each.name.startswith("."))  # all would take long, every few seconds
+        stamps.append(file_stamp(Path(image)))
     return f"{RULES} {stamps}{cuts}"
 
 

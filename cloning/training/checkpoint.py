@@ -295,7 +295,7 @@ class Checkpoint:
             else:
                 print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
             if self.changed:
-                print(f"labels differ by up to {self.changed:.2g}, as on another processor: so will the weights")
+                print(f"labels differ by up to {self.changed:.2g}, as --robust's on another processor; so will weights")
         elif self.run.from_model:
             print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
             print("it may have been trained on this run's validation frames: judge it by a recording that it never saw")

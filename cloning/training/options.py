@@ -51,7 +51,10 @@ class Process:
             raise UserError(f"--device {self.device}: torch finds no such GPU on this machine; leave the option out")
 
 
-EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind))
+def given_by_program(run: Run) -> frozenset[str]:
+    """Return the names of a run's and its recipe's fields: all, but `from_model` only if it names a model."""
+    names = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind))
+    return names if run.from_model else names - {"from_model"}
 
 
 class Command(NamedTuple):
@@ -59,7 +62,7 @@ class Command(NamedTuple):
 
     run: Run
     process: Process
-    given: frozenset[str]  # names of the run's and recipe's fields that the user gave, and "robust"; EVERY_NAME: all
+    given: frozenset[str]  # names of the run's and recipe's fields that the user gave, and "robust"
     recipes: Mapping[str, Recipe]  # those that a checkpoint may have been trained by, by their names
 
 
