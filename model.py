@@ -434,7 +434,7 @@ def execute(command: Command) -> int:
 def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, seed: int = 0, **process: Any) -> int:
     """Train a network by any recipe, as the command does; return the exit status, or under torchrun end with it.
 
-    process: as for the options, or `from_model`: --from; a run is resumed only if its recipe and recordings are these.
+    All as for the options, `from_model` as --from, too; a run is resumed only if its recipe and recordings are these.
     """
     folders = tuple(map(str, [recordings] if isinstance(recordings, str | Path) else recordings))
     run, own = Run(recipe, folders, int(seed), str(process.pop("from_model", None) or "")), {recipe.name: recipe}

@@ -71,7 +71,7 @@ COURSES = {
         crest=35.0,
     ),
 }
-# The points at which the roads of the benchmark begin, by number. They were found when `_start` did not round.
+# Where the roads of the benchmark begin, by number: as in its published scores, from before `_start` rounded.
 STARTS = {
     "road": """
         304 562 332 570 145 62 193 93 147 503 400 350 189 510 369 623 434 307 504 168 178 653 497 516 249 192 515 242 30

@@ -103,9 +103,10 @@ function arrange() {
   renew(element("analysing"), [left, isPaused], () => {
     const title = "Pause the analyses of all recordings, or go on with them";
     const button = makeButton(isPaused ? "Go on" : "Pause", {title}, () =>
-      request("/analyses", {method: isPaused ? "POST" : "DELETE"})
-        .then((_, now = shown) => askAll([...known], ([card, {id}]) => now == shown && fill(id, card, now)))
-        .catch(error => notice(error.message)));
+      request("/analyses", {method: isPaused ? "POST" : "DELETE"}).then(() => {
+        const now = shown;
+        return askAll([...known], ([card, {id}]) => now == shown && fill(id, card, now));
+      }).catch(error => notice(error.message)));
     return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
   });
 }
