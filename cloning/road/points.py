@@ -166,10 +166,9 @@ def _fault(road: PointRoad) -> str:
         advance = (ahead * forwards).sum(axis=1)[: None if road.closed else -1]
         worst = int(advance.argmin())
         if advance[worst] <= 0:
-            bend = 1 / max(abs(track.curvature[max(0, worst - 3) : worst + 4]).max(), 1e-9)
             return (
-                f"the road folds within its own width, {place(worst)}: its bend of about {bend:.1f} m radius "
-                f"is too sharp for {road.width:g} m of width"
+                f"the road folds within its own width, {place(worst)}: its bend's radius is less than half of "
+                f"{road.width:g} m, the width"
             )
     apart = road.width + SHOULDER
     pairs = cKDTree(flat).query_pairs(apart, output_type="ndarray")
