@@ -118,8 +118,8 @@ class Page:
             self.send("Input.dispatchMouseEvent", type=f"mouse{kind}", button="left", buttons=1, clickCount=1, **place)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # moves are late
 
-    def swipe(self, selector: str, *fingers: tuple[float, float]) -> None:
-        """Move fingers over an element, each from one share of its width to another."""
+    def swipe(self, selector: str, *fingers: tuple[float, float], last: str = "touchEnd") -> None:
+        """Move fingers over an element, each from one share of its width to another; last: or touchCancel."""
         self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=len(fingers))
         left, top, width, height = self.box(selector)
         for kind, share in (("touchStart", 0.0), ("touchMove", 0.3), ("touchMove", 1.0)):
@@ -127,7 +127,7 @@ class Page:
             points = [{"x": x, "y": top + height / 2, "id": finger} for finger, x in enumerate(across)]
             self.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        self.send("Input.dispatchTouchEvent", type=last, touchPoints=[])
         self.send("Emulation.setTouchEmulationEnabled", enabled=False)
 
     def wheel(self, selector: str, pixels: float) -> None:

@@ -295,6 +295,13 @@ def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
     assert high - low == pytest.approx(59 / 3, rel=0.1), "two fingers"
     page.swipe("#histogram .u-over", (0.5, 0.9))
     page.shows("#matches", "frames in ")
+    page.swipe("#histogram .u-over", (0.1, 0.4), last="touchCancel")
+    page.wait("document.querySelector('#histogram .u-select').style.width == '0px'")
+    left, top, width, height = page.box("#strip")
+    place = {"x": left + width / 4, "y": top + height / 2}
+    for kind in ("mousePressed", "mouseReleased"):
+        page.send("Input.dispatchMouseEvent", type=kind, button="right", clickCount=1, **place)
+    assert now(page, "plots.zoom") == [low, high], "a menu is asked for"
     assert page.complaints() == []
 
 

@@ -86,7 +86,7 @@ export function showHistogram() {
 }
 
 // uPlot knows the mouse alone: a finger that drags over the histogram is one.
-const MOUSE = {pointerdown: "mousedown", pointermove: "mousemove", pointerup: "mouseup"};
+const MOUSE = {pointerdown: "mousedown", pointermove: "mousemove", pointerup: "mouseup", pointercancel: "mouseup"};
 for (const [pointer, mouse] of Object.entries(MOUSE)) {
   element("histogram").addEventListener(pointer, event => event.pointerType == "touch" && plot?.over.dispatchEvent(
     new MouseEvent(mouse, {clientX: event.clientX, clientY: event.clientY, movementX: 1, bubbles: true})));
