@@ -191,6 +191,14 @@ def test_an_episode_can_be_ended_at_any_time_and_then_telemetry_goes_on():
     assert abs(number(data, "angular_difference")) < 0.1
 
 
+def test_the_bridge_is_a_segment_of_the_road_and_its_walls_are_not():
+    dialect = Episodes(LAKE)
+    dialect.run.s = 730.0
+    dialect.run.set_back()
+    seen = dialect.views[1].segments(dialect.run.car.node.get_transform())
+    assert tuple(seen[110, 160]) == ROAD != tuple(seen[80, 5])
+
+
 def test_flakes_do_not_depend_on_how_many_telemetries_a_pause_had():
     dialect, images = Episodes(LAKE), []
     for telemetries in (1, 3):

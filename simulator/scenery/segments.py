@@ -16,14 +16,13 @@ PLANT, SKY, CAR = (107, 142, 35), (70, 130, 180), (0, 0, 142)
 def segments(scenery: Scenery) -> Scenery:
     """Return the scenery in the colours of its segments, without light, haze and shadows.
 
-    Road is the asphalt with its lines; verge is what lies or stands along it.
+    Road is the asphalt with its lines, and a bridge's cobbles; verge is what lies or stands along one side.
     """
-    road = scenery.asphalt
 
     def kind(mesh: Mesh) -> tuple[int, int, int]:
-        if mesh.texture.shape[2] == 4:
-            return PLANT
-        return ROAD if mesh is road else VERGE if mesh.road is not None else GROUND
+        if mesh.road is None:
+            return PLANT if mesh.texture.shape[2] == 4 else GROUND
+        return ROAD if mesh.road[:, 1].min() < 0 < mesh.road[:, 1].max() else VERGE
 
     return replace(
         scenery,
