@@ -204,6 +204,9 @@ def test_recordings_become_one_with_each_drive_as_it_was(linked, tmp_path):
     (plain / "driving_log.csv").write_text(log + "\n", encoding="utf-8")
     with pytest.raises(RecordingError, match="no time in its name"):
         write_part([recording, read_recording(plain)], tmp_path / "three")
+    (plain / "driving_log.csv").write_text(f"{log}\n" + 16 * "\n" + log.replace("_1.", "_2."), encoding="utf-8")
+    with pytest.raises(RecordingError, match="no time in its name"):  # the pause would be lost
+        write_part([read_recording(plain)], tmp_path / "three")
     assert not (tmp_path / "three").exists()
 
 

@@ -23,6 +23,7 @@ from cloning.recordings.format import (
     LANE_COLUMNS,
     LANE_FILE,
     NUMBERS,
+    SAMPLE_RATE,
     STAMP_LENGTH,
     parse_time_stamp,
     time_stamp,
@@ -41,15 +42,16 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
     log needs no repairs. A `lane.csv` goes along if every recording has one, and it names one of the rows. A recording
     of the same time as another, as a copy is, is put so many days later that each stays a drive of its own. The log is
     written last: a process killed at any time leaves a whole recording, or a folder that is none. Raises RecordingError
-    if the folder exists, if an image is missing, if one of several recordings has images without a time in their names,
-    or if it cannot be written; then nothing is left.
+    if the folder exists, if an image is missing, if one of several recordings, or with a pause between its rows, has
+    images without a time in their names, or if it cannot be written; then nothing is left.
     """
     recordings = sorted(recordings, key=lambda recording: float(recording.time[0]))
     renamed, notes, end = list[dict[str, str]](), list[str](), -inf
     for recording in recordings:
         days = floor(max(-1.0, (end + DRIVE_GAP - recording.time[0]) / DAY.total_seconds())) + 1
         end = recording.time[-1] + (days * DAY).total_seconds()
-        renamed.append(_renamed(recording, days, check=len(recordings) > 1))
+        has_pause = bool((np.diff(recording.lines) > DRIVE_GAP * SAMPLE_RATE).any())  # without times, the lines tell it
+        renamed.append(_renamed(recording, days, check=len(recordings) > 1 or has_pause))
         if days:
             notes.append(f"{recording.folder.name} is put {plural(days, 'day')} later, after another drive")
     lanes = [(recording.folder / LANE_FILE).exists() for recording in recordings]
@@ -106,7 +108,7 @@ def _renamed(recording: Recording, days: int, check: bool) -> dict[str, str]:
             except ValueError:
                 raise RecordingError(
                     f"{recording.folder / IMAGE_FOLDER / name}: no time in its name, by which the drives would follow "
-                    "each other; leave this recording out"
+                    "each other; export each stretch by itself"
                 ) from None
             names[name] = f"{stem[:-STAMP_LENGTH]}{time_stamp(moment)}{dot}{extension}"
     return names
