@@ -109,17 +109,17 @@ class Page:
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"
         return self.run(f"(({{x, y, width, height}}) => [x, y, width, height])({box})")
 
-    def drag(self, selector: str, begin: float, end: float, height: float = 0.5) -> None:
-        """Drag the mouse over an element; begin, end, height: shares of its width and height."""
+    def drag(self, selector: str, begin: float, end: float, height: float = 0.5, button: str = "left") -> None:
+        """Drag the mouse over an element; begin, end, height: shares of its width and height; button: or "right"."""
         left, top, width, tall = self.box(selector)
         kinds, shares = ("Pressed", "Moved", "Moved", "Released"), (begin, (begin + end) / 2, end, end)
         for kind, share in zip(kinds, shares, strict=True):
-            place = {"x": left + share * width, "y": top + height * tall}
-            self.send("Input.dispatchMouseEvent", type=f"mouse{kind}", button="left", buttons=1, clickCount=1, **place)
+            where = {"x": left + share * width, "y": top + height * tall, "buttons": 1 if button == "left" else 2}
+            self.send("Input.dispatchMouseEvent", type=f"mouse{kind}", button=button, clickCount=1, **where)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # moves are late
 
     def swipe(self, selector: str, *fingers: tuple[float, float], last: str = "touchEnd") -> None:
-        """Move fingers over an element, each from one share of its width to another; last: or touchCancel."""
+        """Move fingers over an element, each from one share of its width to another; last: or "touchCancel"."""
         self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=len(fingers))
         left, top, width, height = self.box(selector)
         for kind, share in (("touchStart", 0.0), ("touchMove", 0.3), ("touchMove", 1.0)):

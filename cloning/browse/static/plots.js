@@ -21,7 +21,7 @@ export class Plots {
     this.rows = Array.from({length: this.count}, (_, row) => row);
     this.resizing = new ResizeObserver(() => this.fit());
     this.resizing.observe(element("plots"));
-    element("plots").onpointerdown = () => this.held = true;
+    element("plots").onpointerdown = ({button}) => this.held = !button; // another button's release may go to a menu
     window.onpointerup = window.onpointercancel = () => setTimeout(() => { // after the plot has heard of it
       this.held = false;
       if (this.late) this.build();

@@ -55,7 +55,7 @@ export function zoomable(plot, plots) {
 const strip = element("strip");
 
 strip.onpointerdown = event => {
-  if (event.button) return; // whose release a menu may keep
+  if (event.button) return; // the page may never hear of the release, as where a menu opens
   const now = page.open, {left, width} = strip.getBoundingClientRect();
   const rowAt = px => Math.min(now.count - 1, Math.max(0, Math.round((px - left) / width * now.count - 0.5)));
   const move = dragging(event.target, rowAt(event.clientX), now);
