@@ -108,7 +108,7 @@ def _renamed(recording: Recording, days: int, check: bool) -> dict[str, str]:
             except ValueError:
                 raise RecordingError(
                     f"{recording.folder / IMAGE_FOLDER / name}: no time in its name, by which the drives would follow "
-                    "each other; export each stretch by itself"
+                    "each other; export this recording by itself, one stretch at a time"
                 ) from None
             names[name] = f"{stem[:-STAMP_LENGTH]}{time_stamp(moment)}{dot}{extension}"
     return names

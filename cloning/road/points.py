@@ -167,8 +167,8 @@ def _fault(road: PointRoad) -> str:
         worst = int(advance.argmin())
         if advance[worst] <= 0:
             return (
-                f"the road folds within its own width, {place(worst)}: its bend's radius is less than half of "
-                f"{road.width:g} m, the width"
+                f"the road folds within its own width, {place(worst)}: its bend's radius is less than half of the "
+                f"width, which is {road.width:g} m"
             )
     apart = road.width + SHOULDER
     pairs = cKDTree(flat).query_pairs(apart, output_type="ndarray")
