@@ -16,7 +16,7 @@ from cloning.lane.recovery import MISHAP, LanePosition
 from cloning.lane.search import ALONG, MIN_LOG_LIKELIHOOD, Localisation, Part, followed, known_tracks, search
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
-from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, Stretch, steering_for, stretches
+from cloning.road.motion import MPH, YAW_LAG, Stretch, steering_for, stretches
 from cloning.road.track import ROADS, Track
 
 PAUSE = 0.0714  # s between rows
@@ -46,7 +46,7 @@ def offset_of(rows: int, parts: Iterable[tuple[slice, Localisation]]) -> np.ndar
     """The lateral offset of each row, m, which is 0 in truth; nan where it is not placed."""
     offset = np.full(rows, np.nan)
     for part, found in parts:
-        offset[part] = found.states[:, 1] + REAR_AXLE * np.sin(found.states[:, 2])
+        offset[part] = found.middle()[:, 0]
     return offset
 
 

@@ -24,7 +24,7 @@ from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE
 
-RULES = 7  # of what a result contains: counted up when they change
+RULES = 8  # of what a result contains: counted up when they change
 COMMAND = (*PYTHON, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 

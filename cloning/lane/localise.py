@@ -30,7 +30,7 @@ from cloning.lane.recovery import MISHAP, LanePosition
 from cloning.lane.search import Localisation
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
-from cloning.road.motion import MIN_SPEED, MPH, REAR_AXLE, Stretch
+from cloning.road.motion import MIN_SPEED, MPH, Stretch
 from cloning.road.track import ROADS
 
 LONGEST_MISHAP = 300  # rows: more are another road
@@ -121,9 +121,8 @@ def localise_recording(
         position = first if is_first else last
     position = replace(position, placed=placed, piece=piece)
     for rows, localisation in localised:
-        _, offset, heading_error = localisation.states.T
-        position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
-        position.heading_error[rows], position.trusted[rows] = heading_error, True
+        position.lateral_offset[rows], position.heading_error[rows] = localisation.middle().T
+        position.trusted[rows] = True
     return position, localised
 
 

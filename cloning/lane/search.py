@@ -1,11 +1,13 @@
 """Finds where on which known track a stretch of a recording is, by how its road bends and what a network detects."""
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from cloning.lane.follow import Candidate, TrackFilter
+from cloning.road.motion import REAR_AXLE, wrap_angle
 from cloning.road.track import ROADS, Track
 
 PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
@@ -34,6 +36,18 @@ class Localisation:
     # Root mean square of the changes of the heading error that neither steering nor the track explains, in standard
     # deviations of the process noise: below 1 on the right track, where the car turns as it steers.
     turn_residual: float
+
+    def middle(self) -> np.ndarray:
+        """Return the lateral offset and heading error of the car's middle in each row, as `LanePosition`: (n, 2)."""
+        return np.array([self._middle(*state) for state in self.states.tolist()])
+
+    def _middle(self, s: float, right: float, heading_error: float) -> tuple[float, float]:
+        # Exactly, since in a sharp bend the road turns by 0.16 radians between the rear axle and the middle.
+        axle = self.track.at(s, right)
+        heading = axle.heading - heading_error
+        x, y = axle.x + REAR_AXLE * math.cos(heading), axle.y + REAR_AXLE * math.sin(heading)
+        beside, offset = self.track.locate(x, y, s)
+        return offset, wrap_angle(self.track.at(beside).heading - heading)
 
     def is_certain(self) -> bool:
         """Return whether the stretch certainly is on this track."""
