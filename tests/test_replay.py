@@ -109,6 +109,16 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, lane):
     assert not line.is_lane_centre and not line.offset.any()
 
 
+def test_a_car_that_is_set_back_in_a_bend_follows_it(recording, lane):
+    """The human drives a circle along the lane's centre: the road's direction beside the middle is not the car's."""
+    recording.steering[:], lane.lateral_offset[:] = 0.2, 0
+    lane.heading_error[:] = -REAR_AXLE * curvature(0.2)
+    [line] = replay.reference_lines(recording)
+    car = replay.ReplayedCar(recording, line)
+    car.set_back(150)
+    assert car.yaw == pytest.approx(0, abs=0.01) and car.offset(150) == pytest.approx(0)
+
+
 def test_a_report_tells_known_rows_from_others(recording, lane):
     """The first third placed, then a mishap, then rows whose lane is not trusted."""
     lane.placed[:100], lane.trusted[100:] = True, False

@@ -129,8 +129,8 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
     if lane.trusted.mean() < MIN_TRUSTED:
         return [ReferenceLine.human_path(stretch)]
     ahead = LaneAhead.of_stretch(stretch, lane.lateral_offset, lane.trusted).extended()
-    every, known, sure = np.arange(len(lane)), np.flatnonzero(lane.trusted), lane.take(lane.trusted)
-    offset, yaw = (np.interp(every, known, column) for column in (sure.lateral_offset, sure.heading_error))
+    known = np.flatnonzero(lane.trusted)
+    offset = np.interp(np.arange(len(lane)), known, lane.lateral_offset[known])
     lines = []
     changes = np.flatnonzero(np.diff(np.r_[False, np.abs(offset) < OFF_ROAD, False]))  # onto the road, and off it
     for start, end in changes.reshape(-1, 2).tolist():
@@ -138,7 +138,7 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
             first, rows = stretch.rows.start, slice(start, end)
             part = Stretch.of(recording, slice(first + start, first + end))
             placed = int(lane.placed[rows].sum())
-            lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, placed, ahead.take(rows)))
+            lines.append(ReferenceLine(part, offset[rows], ahead.yaw[rows], True, placed, ahead.take(rows)))
     return lines
 
 
