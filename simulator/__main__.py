@@ -95,14 +95,15 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
     add = command(run_replay, text, server, wait, disturb).add_argument
     add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
-    add("--model", metavar="model.pt", help="drive with this model, or .onnx file, in this process, without drive.py")
+    text = "drive with this model, or .onnx file, in this process; without it, the server at --host and --port drives"
+    add("--model", metavar="model.pt", help=text)
     text = (
         "distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
         "(default 1, as in NVIDIA's evaluation, and 2.5, where on the lake the side of the car is on the edge line)"
     )
     metres = number(float, 0.01, 1000)
     add("--limit", type=metres, nargs="+", default=LIMITS, dest="limits", metavar="LIMIT", help=text)
-    text = "measure offsets from the lane centre (default), which lane.csv or the frames tell, or the human's path"
+    text = "measure offsets from the lane centre (default), which lane.csv or the frames tell, or from the human's path"
     add("--reference", choices=("lane", "human"), default="lane", help=text)
     add("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
     text = "plot lateral offset and steering over time; of several recordings, FILE-RECORDING.png each"
