@@ -75,7 +75,10 @@ class Lanes(LaneAhead):
         return lanes
 
     def from_middle(self) -> np.ndarray:
-        """Return how far right of the recorded car's middle the lane's centre is: float (n,), m; 0 where unknown."""
+        """Return how far right of the recorded car's middle that of a car would be which drives as the labels aim.
+
+        Its rear axle is on the lane's centre, and it heads along the lane: float (n,), m; 0 where the lane is unknown.
+        """
         return -(self.offset + REAR_AXLE * np.sin(self.yaw))
 
     def weights(self, straight: float) -> np.ndarray:
