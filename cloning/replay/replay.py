@@ -47,7 +47,8 @@ class ReferenceLine:
 
     stretch: Stretch  # of the recording, or a part of one
     offset: np.ndarray  # float64 (n,): m from the line to the human driver's car, right positive
-    yaw: np.ndarray  # float64 (n,): radians from the line to the human driver's heading, right positive
+    # float64 (n,): radians from the line's direction beside the rear axle to the human driver's heading, right positive
+    yaw: np.ndarray
     is_lane_centre: bool  # if not, the line is the human driver's path, and offset and yaw are 0
     placed: int  # rows in which the lane is not read from single frames: see `LanePosition`
     ahead: LaneAhead  # the lane ahead at each row, along the same line, known or extended
@@ -129,8 +130,10 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
     if lane.trusted.mean() < MIN_TRUSTED:
         return [ReferenceLine.human_path(stretch)]
     ahead = LaneAhead.of_stretch(stretch, lane.lateral_offset, lane.trusted).extended()
-    known = np.flatnonzero(lane.trusted)
-    offset = np.interp(np.arange(len(lane)), known, lane.lateral_offset[known])
+    every, known, sure = np.arange(len(lane)), np.flatnonzero(lane.trusted), lane.take(lane.trusted)
+    offset, yaw = (np.interp(every, known, column) for column in (sure.lateral_offset, sure.heading_error))
+    # Beside the rear axle, in whose direction the car moves: up to the middle, the lane turns.
+    yaw += REAR_AXLE * 2 * ahead.goal[:, 0] / (ahead.goal**2).sum(axis=1)
     lines = []
     changes = np.flatnonzero(np.diff(np.r_[False, np.abs(offset) < OFF_ROAD, False]))  # onto the road, and off it
     for start, end in changes.reshape(-1, 2).tolist():
@@ -138,7 +141,7 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
             first, rows = stretch.rows.start, slice(start, end)
             part = Stretch.of(recording, slice(first + start, first + end))
             placed = int(lane.placed[rows].sum())
-            lines.append(ReferenceLine(part, offset[rows], ahead.yaw[rows], True, placed, ahead.take(rows)))
+            lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, placed, ahead.take(rows)))
     return lines
 
 
