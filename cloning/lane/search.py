@@ -38,7 +38,7 @@ class Localisation:
     turn_residual: float
 
     def middle(self) -> np.ndarray:
-        """Return the lateral offset and heading error of the car's middle in each row, as `LanePosition`: (n, 2)."""
+        """Return the lateral offset and heading error of the car's middle as in `LanePosition`: float64 (n, 2)."""
         return np.array([self._middle(*state) for state in self.states.tolist()])
 
     def _middle(self, s: float, right: float, heading_error: float) -> tuple[float, float]:
