@@ -132,8 +132,8 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
     ahead = LaneAhead.of_stretch(stretch, lane.lateral_offset, lane.trusted).extended()
     every, known, sure = np.arange(len(lane)), np.flatnonzero(lane.trusted), lane.take(lane.trusted)
     offset, yaw = (np.interp(every, known, column) for column in (sure.lateral_offset, sure.heading_error))
-    # Beside the rear axle, in whose direction the car moves: up to the middle, the lane turns.
-    yaw += REAR_AXLE * 2 * ahead.goal[:, 0] / (ahead.goal**2).sum(axis=1)
+    # The estimate is beside the car's middle. It is set back along the lane beside its rear axle, which is less turned.
+    yaw += REAR_AXLE * curvature(ahead.steering(0, 0))
     lines = []
     changes = np.flatnonzero(np.diff(np.r_[False, np.abs(offset) < OFF_ROAD, False]))  # onto the road, and off it
     for start, end in changes.reshape(-1, 2).tolist():
